@@ -27,7 +27,6 @@ from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.sweep import SweepRequest
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.runs.files import TRACKING, read_config, read_object
-from deepracer_exp.runs.result import BUDGET_REACHED
 from deepracer_exp.sweeps.report.labels import outcome_of
 from deepracer_exp.sweeps.search.objectives import intermediate_value, values_of
 
@@ -238,7 +237,7 @@ def whole_run(run: Path, folder: Path) -> Path:
 
 def _is_whole(run: Path) -> bool:
     summary = read_object(run / "summary.json")
-    return summary.get("status") == "failed" or str(summary.get("reason")).startswith(BUDGET_REACHED)
+    return summary.get("status") == "failed" or summary.get("limit") is not None
 
 
 def hold_against(trial: FrozenTrial, course: Course) -> None:

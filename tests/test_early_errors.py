@@ -184,7 +184,14 @@ def refused(tmp_path_factory, call_at):
     write_run(runs / "own", config | {"network": {"target": "my_network:Net", "kwargs": {}}}, "000001")
     write_run(folder / "alone", config, "000001")
     spent = config["budget"]["env_steps"]
-    write_run(runs / "ended", config, status="finished", reason="budget reached: env_steps", env_steps=spent)
+    write_run(
+        runs / "ended",
+        config,
+        status="finished",
+        reason="budget reached: env_steps",
+        limit="env_steps",
+        env_steps=spent,
+    )
     write_run(recorded / "stopped", config, status="stopped early", reason="converged", env_steps=9)
     store = f"sqlite:///{folder / 'recorded' / 'mlflow.db'}"
     tracked = TrackedRun("a", "a", 0, store=store, run_id="id", complete=True)

@@ -20,7 +20,6 @@ from deepracer_exp.runs.files import (
 )
 from deepracer_exp.runs.folder import is_held
 from deepracer_exp.runs.result import (
-    BUDGET_REACHED,
     FAILED,
     FIGURES,
     INTERRUPTED,
@@ -116,13 +115,13 @@ def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ]
     if summary["status"] in (INTERRUPTED, FAILED):
         return [(resume, "continue it from its last checkpoint"), *steps]
-    rule, _, limit = str(summary["reason"]).partition(BUDGET_REACHED)
+    limit = summary.get("limit")
     spent = {
         "env_steps": summary["env_steps"],
         "iterations": summary["iteration"],
         "minutes": summary["wall_clock_s"] / 60,
     }
-    if rule:
+    if limit is None:
         resume = command_line("resume", own, config, [group for group in GROUPS if group != "stopping"])
         steps.append((f"{resume} stopping=none", "continue it until its budget is used"))
     elif limit in spent:  # else the rest of an experiment's budget decides

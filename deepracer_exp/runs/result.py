@@ -12,8 +12,6 @@ from .files import SUMMARY, read_object
 
 FINISHED, STOPPED_EARLY, INTERRUPTED, FAILED = "finished", "stopped early", "interrupted", "failed"
 """`status` of a run that has ended, as in summary.json."""
-BUDGET_REACHED = "budget reached: "
-"""Beginning of `reason` of a run that has used its budget; the limit's key follows."""
 IN_TRAINING = "training"
 RELIABLE = 0.95
 """Share of complete laps on usual conditions from which on a policy counts as reliable."""

@@ -21,7 +21,7 @@ from deepracer_exp.config.running import BudgetConfig
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.lifeline import given_environment, running
 from deepracer_exp.runs.files import METRICS, SUMMARY, read_config, read_object
-from deepracer_exp.runs.result import BUDGET_REACHED, FAILED, INTERRUPTED
+from deepracer_exp.runs.result import FAILED, INTERRUPTED
 
 _log = logging.getLogger(__name__)
 
@@ -152,7 +152,7 @@ def refuse_ended(run_dir: Path, config: BudgetConfig, overrides: Sequence[str]) 
     status, reason = summary.get("status"), str(summary.get("reason"))
     if status in (None, INTERRUPTED, FAILED):
         return
-    if not reason.startswith(BUDGET_REACHED):
+    if summary.get("limit") is None:
         if "stopping" in map(group_of, overrides):
             return
         clone = command_line("clone", run_word(run_dir), read_config(run_dir))

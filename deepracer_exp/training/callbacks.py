@@ -23,7 +23,7 @@ from deepracer_exp.runs.files import (
     read_config,
     sees_pictures,
 )
-from deepracer_exp.runs.result import BUDGET_REACHED, FINISHED, STOPPED_EARLY
+from deepracer_exp.runs.result import FINISHED, STOPPED_EARLY
 from deepracer_exp.runs.trace import read_trace
 from deepracer_exp.stopping.rules import Decision, StoppingRule, build_rule
 from deepracer_exp.tracking.delivery import ENDS
@@ -203,7 +203,7 @@ class BudgetCallback(Callback):
     def _check(self, trainer: Trainer) -> None:
         limit, fraction = trainer.budget.used(*trainer.usage)
         if fraction >= 1:
-            trainer.request_stop(f"{BUDGET_REACHED}{limit}")
+            trainer.request_stop(f"budget reached: {limit}", limit=limit)
 
 
 class RecordCallback(Callback):

@@ -143,6 +143,7 @@ class Trainer:
         evaluation: of the policy after the last iteration, None if it was not evaluated.
         is_best: whether the policy is the best so far; the next checkpoint becomes `best`.
         stop_reason: why the loop ends, None while it continues.
+        limit: the key of the budget that ended it, None if something else did.
         status: what the run is once it ends without interruption or failure.
     """
 
@@ -199,6 +200,7 @@ class Trainer:
         self.evaluation: Evaluation | None = None
         self.is_best = False
         self.stop_reason: str | None = None
+        self.limit: str | None = None
         self.status = FINISHED
         self._interruption = Interruption()
         self._save_requested = False
@@ -254,13 +256,14 @@ class Trainer:
             self._call("on_train_end")
         return self.stop_reason
 
-    def request_stop(self, reason: str, status: str = FINISHED) -> None:
+    def request_stop(self, reason: str, status: str = FINISHED, limit: str | None = None) -> None:
         """End the run after this iteration; the first request counts.
 
-        `reason` is for the last line of the run and summary.json, `status` FINISHED or STOPPED_EARLY.
+        `reason` is for the last line of the run and summary.json, `status` FINISHED or STOPPED_EARLY, `limit` the
+        key of the budget that is used up.
         """
         if self.stop_reason is None:
-            self.stop_reason, self.status = reason, status
+            self.stop_reason, self.status, self.limit = reason, status, limit
 
     def request_save(self) -> None:
         """Write a checkpoint after this iteration."""
@@ -314,7 +317,7 @@ class Trainer:
         """Pass the rows of metrics.jsonl up to the checkpoint to the callbacks again; return them as they left them."""
         replayed = []
         for row in rows:
-            self.stop_reason, self.status = None, FINISHED  # the last row decides
+            self.stop_reason, self.status, self.limit = None, FINISHED, None  # the last row decides
             self.row = dict(row)
             self._call("on_replay")
             replayed.append(self.row)
@@ -331,6 +334,7 @@ class Trainer:
         summary = {
             "status": status,
             "reason": reason,
+            "limit": self.limit,
             **self.counters(),
             "seed": self.experiment.seed,
             "wall_clock_s": round(self.wall_clock_s, 3),

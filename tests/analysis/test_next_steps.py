@@ -43,7 +43,7 @@ def test_as_long_again_is_twice_the_minutes_used(runs, limit, spent_s, more):
     run = runs[0]
     text = (run / "config.yaml").read_text()
     (run / "config.yaml").write_text(text.replace("minutes: null", f"minutes: {limit}", 1))
-    reason = {"status": "finished", "reason": "budget reached: minutes", "wall_clock_s": spent_s}
+    reason = {"status": "finished", "limit": "minutes", "wall_clock_s": spent_s}
     line, what = next_steps(run, {**read_object(run / "summary.json"), **reason})[-1]
     assert what == "continue it for as long again"
     minutes = [word for word in shlex.split(line) if word.startswith("budget.minutes=")]

@@ -115,7 +115,7 @@ def test_an_experiment_that_has_used_everything_starts_no_run(run):
 
 def test_a_run_that_used_up_the_limit_of_its_experiment_needs_a_higher_one_to_resume(run):
     sibling(run, "first", env_steps=600)
-    spent = {"status": "finished", "reason": "budget reached: experiment_env_steps", "iteration": 4}
+    spent = {"status": "finished", "limit": "experiment_env_steps", "iteration": 4}
     sibling(run, run.name, env_steps=400, **spent)
     with pytest.raises(RunEnded, match=r"give it more, such as budget\.experiment_env_steps="):
         refuse_ended(run, limits(experiment_env_steps=1000), [])
