@@ -162,7 +162,7 @@ def _export(args: argparse.Namespace) -> int:
     if config.format in ("onnx", "car", "aws-model"):
         stored = check_policy(config.run, config.runs_dir, config.tracking.uri, config.checkpoint)
         if config.format == "car":
-            from deepracer_exp.export.car_archive import check_car
+            from deepracer_exp.env.real_car import check_car
 
             check_car(stored.experiment)
     else:

@@ -162,3 +162,18 @@ def car_pictures(frames: NDArray[np.uint8], jpeg_quality: int | None) -> NDArray
             Image.fromarray(picture).save(file, "JPEG", quality=jpeg_quality)
             picture[:] = np.asarray(Image.open(file))
     return small
+
+
+def check_car(experiment: Experiment) -> None:
+    """Refuse a policy that the car could not load, or to which it would show something else.
+
+    Raises:
+        BadInput: naming the key and what would be accepted.
+    """
+    for refusal in car_refusals(experiment):
+        raise BadInput(refusal)
+    if experiment.observation.camera is None:
+        raise BadInput(
+            "observation.camera: null; a model of the service has a camera; accepted: observation=camera, stereo, "
+            "camera_lidar"
+        )

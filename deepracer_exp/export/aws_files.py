@@ -1,21 +1,37 @@
 """The files that the AWS console and deepracer-for-cloud train from: reward function, action space, hyperparameters."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from deepracer_exp.aws.models.hyperparameters import CONSOLE_RANGES, Hyperparameters, hyperparameters_text
-from deepracer_exp.aws.models.model_metadata import LIDARS, LidarSectors, ModelMetadata, model_metadata_text
+from deepracer_exp.aws.models.model_metadata import (
+    LIDARS,
+    LidarSectors,
+    ModelMetadata,
+    beyond_console,
+    model_metadata_text,
+)
 from deepracer_exp.config.custom_files import CARS, TAKEN
 from deepracer_exp.config.driving import ObservationConfig
+from deepracer_exp.config.evaluation import ExportConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.action_space import build_action_space, metadata_of
-from deepracer_exp.errors import writing
+from deepracer_exp.lookup.resolve import StoredRun
+from deepracer_exp.validation.aws_rules import text_findings
 
-CONSOLE_ACTIONS = (2, 30)
-CONSOLE_STEERING_DEG = (-30.0, 30.0)
-CONSOLE_SPEED_MPS = {"discrete": (0.1, 4.0), "continuous": (0.5, 4.0)}
+from .written import Written, reward_text, write_files
+
+
+def export_files(run: StoredRun, _: ExportConfig, folder: Path) -> Written:
+    """Write the files that a training on AWS starts from; arguments, result and errors as for `export.Writer`."""
+    reward = reward_text(run)
+    texts, notes = aws_files(run.experiment, reward)
+    write_files(texts, folder)
+    refused = [
+        f"reward_function.py: deepracer-on-aws would refuse it: {one}" for one in text_findings(reward)
+    ]
+    return (folder / name for name in texts), notes + refused
 
 
 def aws_files(experiment: Experiment, reward: str) -> tuple[dict[str, str], list[str]]:
@@ -31,7 +47,7 @@ def aws_files(experiment: Experiment, reward: str) -> tuple[dict[str, str], list
         "model_metadata.json": model_metadata_text(metadata),
         "hyperparameters.json": hyperparameters_text(learning),
     }
-    return texts, [*_action_notes(metadata), *changed]
+    return texts, [*beyond_console(metadata), *changed]
 
 
 def services_metadata(experiment: Experiment) -> ModelMetadata:
@@ -52,38 +68,6 @@ def sensor_keys(observation: ObservationConfig) -> dict[str, Any]:
         "sensor": (camera, name),
         "lidar_config": LidarSectors(lidar.sectors, lidar.values_per_sector, lidar.furthest_m),
     }
-
-
-def write_files(files: Mapping[str, str | bytes], folder: Path) -> None:
-    """Write files into a folder, replacing those of the same names.
-
-    Raises:
-        BadInput: the folder cannot be created or written.
-    """
-    with writing(folder, "another folder with -o"):
-        for name, content in files.items():
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
-
-
-def _action_notes(metadata: ModelMetadata) -> list[str]:
-    ends = (*metadata.actions, *(end for end in (metadata.low, metadata.high) if end is not None))
-    notes = []
-    fewest, most = CONSOLE_ACTIONS
-    if metadata.actions and not fewest <= len(metadata.actions) <= most:
-        notes.append(
-            f"model_metadata.json: {len(metadata.actions)} actions; the AWS console accepts {fewest} to {most}"
-        )
-    for name, values, (low, high) in (
-        ("steering_angle", [end.steering_deg for end in ends], CONSOLE_STEERING_DEG),
-        ("speed", [end.speed_mps for end in ends], CONSOLE_SPEED_MPS[metadata.action_space_type]),
-    ):
-        if min(values) < low or max(values) > high:
-            notes.append(
-                f"model_metadata.json: {name} from {min(values):g} to {max(values):g}; the AWS console accepts "
-                f"{low:g} to {high:g}"
-            )
-    return notes
 
 
 def hyperparameters_of(experiment: Experiment) -> Hyperparameters:

@@ -1,40 +1,49 @@
 """A policy as a pretrained model that deepracer-for-cloud clones and deepracer-on-aws imports."""
 
-import json
-import time
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 import yaml
 
 from deepracer_exp.agents.actor_critic import ActorCritic, SensorNet, build_actor_critic
 from deepracer_exp.agents.service_weights import to_service
-from deepracer_exp.aws.models.archive import CHECKPOINTS, NEWEST
+from deepracer_exp.aws.models.archive import checkpoint_files
 from deepracer_exp.aws.models.model_metadata import (
     LIDARS,
     NEURAL_NETWORKS,
     ModelMetadata,
     model_metadata_text,
 )
-from deepracer_exp.aws.models.protobuf import field
-from deepracer_exp.aws.models.tf_checkpoint import DATA, INDEX, META, write_checkpoint
 from deepracer_exp.aws.worlds.catalogue import find_world
 from deepracer_exp.config.compose import compose_option
 from deepracer_exp.config.custom_files import services_network
+from deepracer_exp.config.evaluation import ExportConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.learning import CNNConfig
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.errors import BadInput
+from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.checkpoints import StoredPolicy
+from deepracer_exp.runs.result import read_result
 from deepracer_exp.tracks.track import Track
 
 from .aws_files import aws_files, services_metadata
+from .written import Written, reward_text, stored_policy, write_files
 
 _PIXELS = 160, 120
 _LAYERS = ("filters", "kernels", "strides", "hidden", "lidar_hidden")
-_EMPTY_GRAPH = field(2, field(4, field(1, 27)))
-"""A MetaGraphDef whose graph has no nodes; the service requires the file but does not use it to restore weights."""
+
+
+def export_model(run: StoredRun, config: ExportConfig, folder: Path) -> Written:
+    """Write a pretrained model of the service; arguments, result and errors as for `export.Writer`."""
+    stored = stored_policy(run, config)
+    result = read_result(run.path)
+    score = result.completion if result and result.iteration == stored.counters["iteration"] else None
+    files, notes = aws_model(run.experiment, stored, reward_text(run), score)
+    write_files(files, folder)
+    return (folder / name for name in sorted(files)), notes
 
 
 def aws_model(
@@ -56,18 +65,10 @@ def aws_model(
     metadata = replace(metadata, neural_network=services_kind(experiment, metadata))
     texts["model_metadata.json"] = model_metadata_text(metadata)
     texts["training_params.yaml"], unknown = _training_params(experiment)
-    name = f"{stored.counters['iteration']}_Step-{stored.counters['env_steps']}.ckpt"
-    evaluated = {"name": name, "avg_eval_metric": score, "time_stamp": time.time()}
-    texts[f"model/{CHECKPOINTS}"] = json.dumps({"last_checkpoint": evaluated, "best_checkpoint": evaluated})
-    texts[f"model/{NEWEST}"] = name
     # Where deepracer-for-cloud looks for it.
     texts["model/model_metadata.json"] = texts["model_metadata.json"]
-    index, data = write_checkpoint(tensors)
     files = {file: text.encode() for file, text in texts.items()}
-    files |= {
-        f"model/{name}{ending}": content
-        for ending, content in ((INDEX, index), (DATA, data), (META, _EMPTY_GRAPH))
-    }
+    files |= checkpoint_files(tensors, stored.counters["iteration"], stored.counters["env_steps"], score)
     return files, [*note, *unknown, *notes]
 
 

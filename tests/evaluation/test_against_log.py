@@ -9,9 +9,9 @@ import pytest
 
 from deepracer_exp.analysis.against_log import AgainstLog, laps_on, logged_laps, prepare_races
 from deepracer_exp.aws.logs.reader import read_recording
+from deepracer_exp.aws.logs.writer import TRACE_HEADER
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.against_log import course_driven, race_as_logged
-from deepracer_exp.export.aws_logs import TRACE_HEADER
 from deepracer_exp.tracks.track import Track
 from tests.analysis.made_up import Drive, made_up_recording
 

@@ -9,6 +9,7 @@ import os
 import re
 import stat
 import tarfile
+import time
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
@@ -24,7 +25,17 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.files import LOG_BYTES, SETTINGS_BYTES
 
 from .graph_def import GRAPH_BYTES, read_weights
-from .tf_checkpoint import DATA, DATA_BYTES, INDEX, INDEX_BYTES, read_index, read_tensors
+from .protobuf import field
+from .tf_checkpoint import (
+    DATA,
+    DATA_BYTES,
+    INDEX,
+    INDEX_BYTES,
+    META,
+    read_index,
+    read_tensors,
+    write_checkpoint,
+)
 
 Tensors = Mapping[str, npt.NDArray[np.float32]]
 
@@ -38,6 +49,10 @@ _MOST_FILES = 100_000
 _LOGS = re.compile(r"simtrace/.*\.csv$|\.log$")
 _HEADER_BYTES = 2**20
 """Most bytes of a long name in an archive."""
+
+
+_EMPTY_GRAPH = field(2, field(4, field(1, 27)))
+"""A MetaGraphDef whose graph has no nodes; the service requires the file but does not use it to restore weights."""
 
 
 class StoredModel(NamedTuple):
@@ -263,3 +278,25 @@ class _Member(tarfile.TarInfo):
         ):
             raise BadInput(f"{archive.name!s}: a header of {self.size:,} bytes; accepted: {_ACCEPTED}")
         return super()._proc_member(archive)  # type: ignore[misc]
+
+
+def checkpoint_files(tensors: Tensors, number: int, steps: int, progress: float | None) -> dict[str, bytes]:
+    """Return the files of a model's only checkpoint by their names.
+
+    Args:
+        tensors: the weights, as the service names them.
+        number: of the checkpoint.
+        steps: control steps driven before it.
+        progress: mean progress of its evaluation in per cent; None without one.
+    """
+    name = f"{number}_Step-{steps}.ckpt"
+    evaluated = {"name": name, "avg_eval_metric": progress, "time_stamp": time.time()}
+    listed = json.dumps({"last_checkpoint": evaluated, "best_checkpoint": evaluated})
+    index, data = write_checkpoint(tensors)
+    return {
+        f"model/{CHECKPOINTS}": listed.encode(),
+        f"model/{NEWEST}": name.encode(),
+        f"model/{name}{INDEX}": index,
+        f"model/{name}{DATA}": data,
+        f"model/{name}{META}": _EMPTY_GRAPH,
+    }

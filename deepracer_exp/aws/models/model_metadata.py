@@ -220,3 +220,29 @@ def model_metadata_text(metadata: ModelMetadata) -> str:
     if "DISCRETIZED_SECTOR_LIDAR" in metadata.sensor:
         values["lidar_config"] = metadata.lidar_config._asdict()
     return json.dumps(values, indent=2) + "\n"
+
+
+CONSOLE_ACTIONS = (2, 30)
+CONSOLE_STEERING_DEG = (-30.0, 30.0)
+CONSOLE_SPEED_MPS = {"discrete": (0.1, 4.0), "continuous": (0.5, 4.0)}
+
+
+def beyond_console(metadata: ModelMetadata) -> list[str]:
+    """Return a line on each property of an action space that the AWS console does not accept."""
+    ends = (*metadata.actions, *(end for end in (metadata.low, metadata.high) if end is not None))
+    notes = []
+    fewest, most = CONSOLE_ACTIONS
+    if metadata.actions and not fewest <= len(metadata.actions) <= most:
+        notes.append(
+            f"model_metadata.json: {len(metadata.actions)} actions; the AWS console accepts {fewest} to {most}"
+        )
+    for name, values, (low, high) in (
+        ("steering_angle", [end.steering_deg for end in ends], CONSOLE_STEERING_DEG),
+        ("speed", [end.speed_mps for end in ends], CONSOLE_SPEED_MPS[metadata.action_space_type]),
+    ):
+        if min(values) < low or max(values) > high:
+            notes.append(
+                f"model_metadata.json: {name} from {min(values):g} to {max(values):g}; the AWS console accepts "
+                f"{low:g} to {high:g}"
+            )
+    return notes
