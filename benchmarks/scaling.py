@@ -26,8 +26,9 @@ from mlflow import MlflowClient
 from mlflow.entities import Metric
 from optuna.storages import RDBStorage
 
-from deepracer_exp.sweeps.queue.claims import TrialClaims
+from deepracer_exp.sweeps.queue.claims import TABLE, TrialClaims
 from deepracer_exp.sweeps.queue.storage import open_storage
+from deepracer_exp.sweeps.trial import SeedRun, as_json
 
 from .command import command_line
 from .report import benchmark_parser, number, table, write_json
@@ -126,7 +127,7 @@ def real_sweep(args: argparse.Namespace, folder: Path, iterations: int) -> dict[
         raise SystemExit(done.stderr)
     runs = [path.parent for path in folder.glob(f"runs/{name}/*/summary.json")]
     claims = TrialClaims(storage.engine, name).all()
-    held_s = sum(run["took_s"] for claim in claims for run in claim.runs)
+    held_s = sum(run.took_s or 0.0 for claim in claims for run in claim.trial.runs)
     return {
         "iterations": iterations,
         "seconds": took_s,
@@ -182,27 +183,27 @@ def single_calls(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
 
 def fill(storage: RDBStorage, study: str, trials: int) -> None:
     """Give a study `trials` finished trials, as large as those of the default experiment."""
-    run = {
-        "run_dir": "x" * 120,
-        "reason": "x" * 60,
-        "status": "finished",
-        "value": [10.0],
-        "outcome": "finished",
-    }
-    attrs = json.dumps({"overrides": ["x" * 40] * 8, "runs": [run], "env_steps": 10**6, "reason": "x" * 60})
-    row = {"attempt": 1, "owner": "bench:1:a", "state": "reported", "expires_s": 0.0, "outcome": "COMPLETE"}
+    run = SeedRun(
+        seed=0,
+        run_dir="x" * 120,
+        reason="x" * 60,
+        status="finished",
+        values=[10.0],
+        ending="finished",
+        env_steps=10**6,
+    )
+    row = {"attempt": 1, "owner": "bench:1:a", "state": "COMPLETE", "is_reported": True, "expires_s": 0.0}
     TrialClaims(storage.engine, study)
-    there = sa.Table("deepracer_slots", sa.MetaData(), autoload_with=storage.engine)
+    there = sa.Table(TABLE, sa.MetaData(), autoload_with=storage.engine)
     rows = [
         {
             **row,
             "study": study,
-            "slot": index,
-            "runs": json.dumps([run]),
+            "number": number,
+            "runs": json.dumps(as_json([run])),
             "objective_values": "[10.0]",
-            "attrs": attrs,
         }
-        for index in range(trials)
+        for number in range(trials)
     ]
     with storage.engine.begin() as connection:
         connection.execute(sa.insert(there), rows)

@@ -50,10 +50,11 @@ from deepracer_exp.config.sweep import Pruner, compose_sweep
 from deepracer_exp.sweeps.queue.storage import open_storage
 from deepracer_exp.sweeps.queue.study import load_study
 from deepracer_exp.sweeps.report.best import best_trial
-from deepracer_exp.sweeps.report.labels import outcome_of
+from deepracer_exp.sweeps.report.labels import ending_of
 from deepracer_exp.sweeps.search.objectives import cost
 from deepracer_exp.sweeps.search.pruners import build_pruner
 from deepracer_exp.sweeps.sweep import fresh
+from deepracer_exp.sweeps.trial import Trial
 
 from .command import at_once
 from .fresh import TRIALS, Driven, drive
@@ -165,13 +166,11 @@ def benchmark(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     (objective,) = config.objectives
     noted = started(overrides, folder)
     study = load_study(request.study, open_storage(config.storage, folder / "runs"))
-    # Without those whose worker was killed while it created them.
-    trials = [trial for trial in study.get_trials(deepcopy=False) if "runs" in trial.user_attrs]
+    trials = study.get_trials(deepcopy=False)
     own_runs = {
-        trial.number: folder / "runs" / request.study / Path(trial.user_attrs["run_dir"] or "").name
-        for trial in trials
+        trial.number: Trial.of(trial).runs[0].folder(folder / "runs" / request.study) for trial in trials
     }
-    cut_short = [trial.number for trial in trials if outcome_of(trial) not in ("finished", "failed")]
+    cut_short = [trial.number for trial in trials if ending_of(trial) not in ("finished", "failed")]
     resumed = at_once(
         options.workers,
         [partial(whole_run, own_runs[number], folder / "whole" / f"{number:03d}") for number in cut_short],
@@ -187,8 +186,8 @@ def benchmark(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
         Course(
             number=trial.number,
             points=(),
-            env_steps=trial.user_attrs["env_steps"],
-            outcome=outcome_of(trial),
+            env_steps=Trial.of(trial).env_steps,
+            outcome=ending_of(trial),
             value=trial.values[0] if trial.state == TrialState.COMPLETE else None,
         )
         for trial in trials

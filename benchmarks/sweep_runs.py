@@ -21,14 +21,15 @@ from typing import Any
 import optuna
 from optuna.pruners import BasePruner
 from optuna.study import StudyDirection
-from optuna.trial import FrozenTrial, Trial, TrialState
+from optuna.trial import FrozenTrial, TrialState
 
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.sweep import SweepRequest
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.runs.files import TRACKING, read_config, read_object
-from deepracer_exp.sweeps.report.labels import outcome_of
+from deepracer_exp.sweeps.report.labels import ending_of
 from deepracer_exp.sweeps.search.objectives import intermediate_value, values_of
+from deepracer_exp.sweeps.trial import Trial
 
 from .command import command_line, read_metrics, read_summary
 from .fresh import stored_policy
@@ -140,7 +141,7 @@ def _worker(
         )
 
 
-def _report(study: optuna.Study, trial: Trial, course: Course, pruned: bool) -> None:
+def _report(study: optuna.Study, trial: optuna.Trial, course: Course, pruned: bool) -> None:
     if pruned:
         study.tell(trial, state=TrialState.PRUNED)
     elif course.value is None:
@@ -246,15 +247,15 @@ def hold_against(trial: FrozenTrial, course: Course) -> None:
     Raises:
         SystemExit: naming the trial and the difference.
     """
-    outcome, until = outcome_of(trial), trial.user_attrs["env_steps"]
-    if outcome == "failed":
+    ending, until = ending_of(trial), Trial.of(trial).env_steps
+    if ending == "failed":
         return
     reports = {step: value for step, (at, value) in enumerate(course.points, 1) if at <= until}
     if trial.intermediate_values != reports:
         raise SystemExit(
             f"trial {trial.number}: reported {trial.intermediate_values} to Optuna, its complete run reports {reports}"
         )
-    if outcome == "finished" and trial.values[0] != course.value:
+    if ending == "finished" and trial.values[0] != course.value:
         raise SystemExit(
             f"trial {trial.number}: had the value {trial.values[0]} and has {course.value} again"
         )
@@ -291,8 +292,8 @@ def score(run: Path, objective: str, protocol: EvaluationConfig) -> float:
 
 def pace_of(trials: Sequence[FrozenTrial]) -> Pace:
     """Return how long steps and trials took in a sweep."""
-    runs = [run for trial in trials for run in trial.user_attrs["runs"] if run["env_steps"]]
+    runs = [run for trial in trials for run in Trial.of(trial).runs if run.env_steps]
     # A trial that was taken over had its time in two parts, of which only the last is in `took_s`.
-    besides_s = [max(run["took_s"] - run["wall_clock_s"], 0.0) for run in runs if "took_s" in run]
-    steps, driven_s = sum(run["env_steps"] for run in runs), sum(run["wall_clock_s"] for run in runs)
+    besides_s = [max(run.took_s - run.wall_clock_s, 0.0) for run in runs if run.took_s is not None]
+    steps, driven_s = sum(run.env_steps for run in runs), sum(run.wall_clock_s for run in runs)
     return Pace(step_s=driven_s / steps, trial_s=statistics.median(besides_s))

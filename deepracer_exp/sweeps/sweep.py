@@ -4,7 +4,7 @@ import collections
 import contextlib
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,6 @@ from deepracer_exp.config.running import MLflowTracking
 from deepracer_exp.config.sweep import SweepConfig, SweepRequest
 from deepracer_exp.env.real_car import require_car
 from deepracer_exp.env.setup import build_setup
-from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.evaluator import Evaluator, OnStep
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, Group
 from deepracer_exp.lookup.resolve import resolve
@@ -37,20 +36,30 @@ from deepracer_exp.tracking.study_run import Progress, StudyRun
 from deepracer_exp.tracking.tracking_file import Status
 from deepracer_exp.training.signals import Interruption
 
-from .queue.claims import Claim, TrialClaims, fail_unclaimed_trials, report_results
+from .queue.claims import Claim, TrialClaims, report_results
 from .queue.driver import Driver
 from .queue.launcher import LocalLauncher
+from .queue.parent import Parent
 from .queue.ray_launcher import RayLauncher
 from .queue.storage import open_storage, patiently, resolve_database
 from .queue.study import load_request, open_study
 from .queue.worker import Interrupted
 from .queue.worker_config import WorkerConfig
-from .report.best import best_line, best_shown, best_trial, best_values, complete_trials, write_best
+from .report.best import (
+    FreshLaps,
+    best_line,
+    best_shown,
+    best_trial,
+    best_values,
+    complete_trials,
+    write_best,
+)
 from .report.view import SweepView
 from .search.objectives import cost, values_of, without_lap
 from .search.pruners import build_pruner
 from .search.samplers import build_sampler
 from .search.space import SearchSpace
+from .trial import Trial
 
 _log = logging.getLogger("deepracer_exp")
 
@@ -78,8 +87,8 @@ def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]
     runs_dir, protocol = request.runs_dir, request.protocol
     config = request.entry.sweep
     request = _without_rules(request, overrides)
-    parent = _parent(request, runs_dir, known)
-    compose = partial(_composed, request.study, parent, runs_dir, request.stored)
+    parent = _parent(request, known)
+    compose = partial(_composed, request, parent)
     space = SearchSpace.from_request(request, (lambda lines: compose(lines)[1].mapping) if parent else None)
     build_sampler(config, space)
     build_pruner(config)
@@ -165,8 +174,7 @@ def _run(
             code = Driver(worker_config, storage, launcher, view.show, track).run(interruption)
             if code is not None:
                 return code
-        for derive in (report_results, fail_unclaimed_trials):
-            patiently(partial(derive, claims, storage), patience_s)
+        patiently(partial(report_results, claims, storage), patience_s)
         try:
             _conclude(worker_config, study, view, claims, interruption)
         except Interrupted:
@@ -180,14 +188,14 @@ def _run(
 
 def _progress(claims: Sequence[Claim], config: SweepConfig, study: Study) -> Progress:
     """Return the progress of the study, for MLflow."""
-    results = [one.result for one in claims if one.result is not None]
-    counts = collections.Counter(result.state for result in results)
+    ended = [claim.trial for claim in claims if claim.has_ended]
+    counts = collections.Counter(trial.state for trial in ended)
     known: dict[str, Any] = {
         "total": config.trials,
         "complete": counts["COMPLETE"],
         "pruned": counts["PRUNED"],
         "failed": counts["FAIL"],
-        "env_steps": sum(result.attrs.get("env_steps", 0) for result in results),
+        "env_steps": sum(trial.env_steps for trial in ended),
     }
     if not complete_trials(study):
         return Progress(**known)
@@ -198,8 +206,8 @@ def _progress(claims: Sequence[Claim], config: SweepConfig, study: Study) -> Pro
         best_values=dict(zip(config.objectives, best_values(study), strict=True)),
         best_shown=best_shown(study),
         best_line=best_line(study),
-        lap_time_s=best.user_attrs.get("lap_time_s"),
-        completion=best.user_attrs.get("completion"),
+        lap_time_s=Trial.of(best).lap_time_s,
+        completion=Trial.of(best).completion,
     )
 
 
@@ -233,7 +241,7 @@ def _conclude(
 
         again = rerank(worker_config, study, show, check)
         study.set_user_attr("reranked_of", len(complete_trials(study)))
-        study.set_user_attr("reranked", again)
+        study.set_user_attr("reranked", [asdict(laps) for laps in again])
         view.show(claims.all())
     else:
         study.set_user_attr("reranked", [])
@@ -257,36 +265,23 @@ def _without_rules(request: SweepRequest, overrides: Sequence[str]) -> SweepRequ
     return replace(request, base=(*base, "stopping=none"))
 
 
-def _parent(request: SweepRequest, runs_dir: Path, known: Study | None) -> tuple[str, ...]:
-    """Return the overrides that name the parent's run and checkpoint, as `WorkerConfig.parent`.
-
-    `best:NAME` and aliases may name another run later: they are resolved when a study is begun.
-    """
-    parent = request.entry.parent
-    if parent is None:
-        return ()
-    if known is not None and known.user_attrs.get("parent") == parent and "parent_run" in known.user_attrs:
-        return tuple(line for line in known.user_attrs["parent_run"] if key_of(line) in ("run", "checkpoint"))
-
-    from deepracer_exp.training.clone import prepare_clone
-
-    try:
-        _, lineage = prepare_clone([f"run={parent}", f"name={request.study}"], runs_dir, None).start
-    except BadInput as error:
-        raise BadInput(f"parent={parent}: {str(error).removeprefix(f'{parent}: ')}") from error
-    return f"run={lineage.parent_dir}", f"checkpoint={int(lineage.checkpoint)}"
+def _parent(request: SweepRequest, known: Study | None) -> Parent | None:
+    """Return the run that trials clone: the stored one of a study that has begun."""
+    run = request.entry.parent
+    if run is None:
+        return None
+    if known is not None and known.user_attrs.get("parent") == run and "parent_run" in known.user_attrs:
+        return Parent(**known.user_attrs["parent_run"])
+    return Parent.find(run, request.study, request.runs_dir)
 
 
 def _composed(
-    study: str, parent: tuple[str, ...], runs_dir: Path, stored: bool, overrides: list[str]
+    request: SweepRequest, parent: Parent | None, overrides: list[str]
 ) -> tuple[Experiment, Composition]:
     """Return the experiment of a trial with these overrides, of a clone if trials have a parent."""
-    if not parent:
-        return compose_experiment(overrides, stored=stored)
-
-    from deepracer_exp.training.clone import prepare_clone
-
-    clone = prepare_clone([*parent, *overrides, f"name={study}"], runs_dir, None, stored=stored)
+    if parent is None:
+        return compose_experiment(overrides, stored=request.stored)
+    clone = parent.clone([*overrides, f"name={request.study}"], request.runs_dir, stored=request.stored)
     return clone.experiment, clone.composition
 
 
@@ -313,21 +308,21 @@ def fresh(protocol: EvaluationConfig, trials: int) -> EvaluationConfig:
 
 def rerank(
     worker_config: WorkerConfig, study: optuna.Study, on_next: Callable[[FrozenTrial], None], on_step: OnStep
-) -> list[dict[str, Any]]:
+) -> list[FreshLaps]:
     """Race the best checkpoints of the best trials on fresh laps; return their results, the best first.
 
-    `values` are means over a trial's runs. `interval` is the 95 per cent interval of the first of them, by bootstrap
-    over laps: of these policies, not of further trainings. `on_next` is called with each trial before its laps,
-    `on_step` after each control step; what they raise ends it.
+    The interval is a bootstrap over laps: of these policies, not of further trainings. `on_next` is called with each
+    trial before its laps, `on_step` after each control step; what they raise ends it.
     """
     config = worker_config.config
     protocol = fresh(worker_config.protocol, config.rerank_laps)
     found = []
     for trial in complete_trials(study)[: config.rerank]:
         on_next(trial)
-        driven = [_driven(Path(run["run_dir"]), protocol, on_step) for run in trial.user_attrs["runs"]]
+        runs = Trial.of(trial).runs
+        driven = [_driven(run.folder(worker_config.folder), protocol, on_step) for run in runs]
         found.append(_reranked(trial.number, driven, config.objectives, protocol.time_s))
-    return sorted(found, key=lambda one: cost(config.objectives, one["values"]))
+    return sorted(found, key=lambda laps: cost(config.objectives, laps.values))
 
 
 def interval_of(evaluations: Sequence[Evaluation], objective: str, trial_time_s: float) -> list[float]:
@@ -395,14 +390,14 @@ def _driven(run_dir: Path, protocol: EvaluationConfig, on_step: OnStep) -> Evalu
 
 def _reranked(
     number: int, driven: Sequence[Evaluation], objectives: Sequence[str], trial_time_s: float
-) -> dict[str, Any]:
+) -> FreshLaps:
     times = [time for one in driven if (time := one.on(USUAL).mean_lap_time_s) is not None]
     held_out = [one.on(HELD_OUT).completion for one in driven if HELD_OUT in one.conditions]
-    return {
-        "trial": number,
-        "values": np.mean([values_of(one, objectives, trial_time_s) for one in driven], axis=0).tolist(),
-        "interval": interval_of(driven, objectives[0], trial_time_s),
-        "lap_time_s": float(np.mean(times)) if times else None,
-        "completion": float(np.mean([one.on(USUAL).completion for one in driven])),
-        "held_out_completion": float(np.mean(held_out)) if held_out else None,
-    }
+    return FreshLaps(
+        trial=number,
+        values=np.mean([values_of(one, objectives, trial_time_s) for one in driven], axis=0).tolist(),
+        interval=interval_of(driven, objectives[0], trial_time_s),
+        lap_time_s=float(np.mean(times)) if times else None,
+        completion=float(np.mean([one.on(USUAL).completion for one in driven])),
+        held_out_completion=float(np.mean(held_out)) if held_out else None,
+    )

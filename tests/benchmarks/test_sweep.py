@@ -15,6 +15,7 @@ from benchmarks.same import different_rows
 from benchmarks.sweep_runs import Course, Ended, Pace, makespan_s, replay
 from deepracer_exp.config.compose import compose_evaluation
 from deepracer_exp.config.sweep import compose_sweep
+from deepracer_exp.sweeps.trial import SeedRun, as_json
 
 PACE = Pace(step_s=0.01, trial_s=5.0)
 STEPS = 1000
@@ -122,8 +123,8 @@ def test_a_trial_that_reported_something_else_than_its_complete_run_is_refused()
     whole = course(0, [12.0, 10.0, 9.0, 8.0])
 
     def trial(reports: dict[int, float]) -> FrozenTrial:
-        attrs = {"env_steps": 2500, "outcome": "collapsed"}
-        return create_trial(state=TrialState.PRUNED, intermediate_values=reports, user_attrs=attrs)
+        runs = as_json([SeedRun(seed=0, env_steps=2500, ending="collapsed")])
+        return create_trial(state=TrialState.PRUNED, intermediate_values=reports, user_attrs={"runs": runs})
 
     sweep_runs.hold_against(trial({1: 12.0, 2: 10.0}), whole)
     for reports in ({1: 12.0}, {1: 12.0, 2: 10.5}, {1: 12.0, 2: 10.0, 3: 9.0}):
@@ -133,10 +134,10 @@ def test_a_trial_that_reported_something_else_than_its_complete_run_is_refused()
 
 def test_the_pace_is_that_of_all_steps_and_of_the_usual_trial() -> None:
     def trial(env_steps: int, wall_clock_s: float, took_s: float) -> FrozenTrial:
-        run = {"env_steps": env_steps, "wall_clock_s": wall_clock_s, "took_s": took_s}
-        return create_trial(value=1.0, user_attrs={"runs": [run]})
+        run = SeedRun(seed=0, env_steps=env_steps, wall_clock_s=wall_clock_s, took_s=took_s)
+        return create_trial(value=1.0, user_attrs={"runs": as_json([run])})
 
-    failed = create_trial(state=TrialState.FAIL, user_attrs={"runs": [{"env_steps": 0, "wall_clock_s": 0.0}]})
+    failed = create_trial(state=TrialState.FAIL, user_attrs={"runs": as_json([SeedRun(seed=0)])})
     found = sweep_runs.pace_of(
         [trial(1000, 10.0, 14.0), trial(3000, 20.0, 26.0), trial(2000, 30.0, 20.0), failed]
     )

@@ -50,19 +50,19 @@ def kill(request):
 
 def ended(cwd):
     with contextlib.closing(sqlite3.connect(cwd / "runs" / "sweeps.db")) as study:
-        return study.execute("SELECT count(*) FROM deepracer_slots WHERE outcome IS NOT NULL").fetchone()[0]
+        return study.execute("SELECT count(*) FROM deepracer_trials WHERE state IS NOT NULL").fetchone()[0]
 
 
 def on_last_try(cwd):
     """Return whether a trial would count as failed if its worker were lost once more before the next checkpoint."""
-    under_way = [claim for claim in claims(cwd) if claim.state == "claimed"]
-    return any(run.get("tries", 1) >= 3 for claim in under_way for run in claim.runs)
+    under_way = [claim for claim in claims(cwd) if not claim.has_ended]
+    return any(run.tries >= 3 for claim in under_way for run in claim.trial.runs)
 
 
 def rest(start, cwd):
     """Finish the trials that have begun, in a sweep without kills."""
     # Workers that claim at the same moment spread out, so that a trial before the last may not have begun.
-    begun = max((claim.index for claim in claims(cwd)), default=0) + 1
+    begun = max((claim.trial.number for claim in claims(cwd)), default=0) + 1
     Sweep(start, cwd, f"sweep.trials={begun}").end()
     assert_every_trial_is_accounted_for_once(cwd, trials=begun)
 

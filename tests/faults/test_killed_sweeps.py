@@ -18,6 +18,7 @@ import pytest
 from deepracer_exp.runs.files import read_metrics, read_object
 from deepracer_exp.sweeps.queue.claims import TrialClaims
 from deepracer_exp.sweeps.queue.storage import open_storage
+from deepracer_exp.sweeps.trial import Trial
 from tests.waiting import PATIENCE_S
 
 TIMES = range(int(os.environ.get("FAULT_TIMES", "1")))
@@ -95,26 +96,20 @@ def assert_every_trial_is_accounted_for_once(cwd, storage=None, trials=TRIALS, i
     """The study has each trial once, with the value of a run that has each of its iterations once."""
     opened = open_storage(storage, cwd / "runs")
     found = TrialClaims(opened.engine, "s").all()
-    assert [claim.index for claim in found] == list(range(trials))
-    assert {claim.state for claim in found} == {"reported"}
-    known = {one._trial_id: one for one in optuna.load_study(study_name="s", storage=opened).trials}
-    assert {claim.trial_id for claim in found} == {
-        key for key, one in known.items() if one.state == optuna.trial.TrialState.COMPLETE
-    }
-    # A worker may be killed just after it created a trial, which fails then.
-    rest = [one.state for key, one in known.items() if key not in {claim.trial_id for claim in found}]
-    assert set(rest) <= {optuna.trial.TrialState.FAIL}
-    for claim in found:
-        trial = known[claim.trial_id]
-        assert trial.user_attrs["slot"] == claim.index
-        assert trial.values == claim.result.values
-        (run,) = trial.user_attrs["runs"]
-        assert trial.values == run["value"]
-        folder = cwd / "runs" / "s" / Path(run["run_dir"]).name
+    assert all(claim.is_reported for claim in found)
+    assert [claim.trial.number for claim in found] == list(range(trials))
+    known = optuna.load_study(study_name="s", storage=opened).trials
+    # The queue and Optuna have the same trials by the same numbers, whoever was killed when.
+    assert [Trial.of(one) for one in known] == [claim.trial for claim in found]
+    assert {one.state for one in known} == {optuna.trial.TrialState.COMPLETE}
+    for trial in (claim.trial for claim in found):
+        (run,) = trial.runs
+        assert trial.values == run.values
+        folder = cwd / "runs" / "s" / Path(run.run_dir).name
         assert read_object(folder / "summary.json")["status"] == "finished"
         rows = [row["iteration"] for row in read_metrics(folder / "metrics.jsonl")]
         assert rows == list(range(1, iterations + 1))
-    assert len({trial.params["algorithm.lr"] for trial in known.values() if trial.params}) == trials
+    assert len({trial.params["algorithm.lr"] for trial in known}) == trials
 
 
 @pytest.mark.parametrize("seed", TIMES)
@@ -148,11 +143,11 @@ def test_ctrl_c_begins_no_other_trial_and_leaves_those_under_way_ready_to_resume
     assert interrupted(running) < SOON_S
     begun = claims(tmp_path)
     assert {claim.attempt for claim in begun} == {1}
-    open_ones = [claim for claim in begun if claim.result is None]
+    open_ones = [claim for claim in begun if not claim.has_ended]
     assert len(open_ones) <= 2
     assert all(claim.expired for claim in open_ones)
     # Workers that claimed at the same moment may have left a gap.
-    trials = 1 + max(claim.index for claim in begun)
+    trials = 1 + max(claim.trial.number for claim in begun)
     sweep(f"sweep.trials={trials}").end()
     assert_every_trial_is_accounted_for_once(tmp_path, trials=trials)
 
@@ -164,7 +159,7 @@ def test_ctrl_c_ends_a_sweep_whose_trials_would_take_minutes_to_end(sweep, tmp_p
         "import time\n\n\ndef reward_function(params):\n    time.sleep(0.2)\n    return 1.0\n"
     )
     running = sweep("sweep.workers=2", "reward.file=slow.py", "reward.time_limit_s=19", "collector.cars=4")
-    running.wait_for(lambda: len([claim for claim in claims(tmp_path) if claim.runs]) == 2, "runs")
+    running.wait_for(lambda: len([claim for claim in claims(tmp_path) if claim.trial.runs]) == 2, "runs")
     assert interrupted(running, times) < within_s
 
 
@@ -204,22 +199,25 @@ def test_a_worker_that_wakes_up_after_its_lease_writes_neither_into_the_study_no
     held, late = running.wait_for(lambda: suspended(running), "trial under way")
     try:
         taken = running.wait_for(
-            lambda: next((s for s in claims(tmp_path) if s.index == held.index and s.attempt > 1), None),
+            lambda: next(
+                (s for s in claims(tmp_path) if s.trial.number == held.trial.number and s.attempt > 1), None
+            ),
             "other worker that takes over",
         )
         assert taken.owner != held.owner
         running.wait_for(
-            lambda: next(s for s in claims(tmp_path) if s.index == held.index).state == "reported", "result"
+            lambda: next(s for s in claims(tmp_path) if s.trial.number == held.trial.number).is_reported,
+            "result",
         )
     finally:
         late.resume()
     running.end()
     assert_every_trial_is_accounted_for_once(tmp_path, iterations=40)
-    claim = next(claim for claim in claims(tmp_path) if claim.index == held.index)
+    claim = next(claim for claim in claims(tmp_path) if claim.trial.number == held.trial.number)
     assert claim.attempt == taken.attempt
     # The sleeper held its folder, so that the other one continued in a copy.
-    assert claim.runs[0]["run_dir"] != held.runs[0]["run_dir"]
-    assert not (Path(held.runs[0]["run_dir"]) / "summary.json").exists()
+    assert claim.trial.runs[0].run_dir != held.trial.runs[0].run_dir
+    assert not (Path(held.trial.runs[0].run_dir) / "summary.json").exists()
 
 
 def is_locked(cwd):
@@ -237,12 +235,12 @@ def suspended(running):
     Not while it writes to the study: others wait for the lock on the file, however long its owner sleeps.
     """
     for claim in claims(running.cwd):
-        if claim.state == "claimed" and claim.runs:
+        if not claim.has_ended and claim.trial.runs:
             worker = psutil.Process(int(claim.owner.rsplit(":", 2)[1]))
             worker.suspend()
-            (now,) = [one for one in claims(running.cwd) if one.index == claim.index]
-            is_ours = now.state == "claimed" and now.owner == claim.owner and not is_locked(running.cwd)
-            if is_ours and not (Path(now.runs[-1]["run_dir"]) / "summary.json").exists():
+            (now,) = [one for one in claims(running.cwd) if one.trial.number == claim.trial.number]
+            is_ours = not now.has_ended and now.owner == claim.owner and not is_locked(running.cwd)
+            if is_ours and not (Path(now.trial.runs[-1].run_dir) / "summary.json").exists():
                 return now, worker
             worker.resume()
     return None

@@ -17,7 +17,7 @@ def claim_all(url: str, file: Path, start: Barrier, total: int, lease_s: float) 
     claims, count = TrialClaims(engine, "study"), 0
     with file.open("w", buffering=1) as out:
         while (claim := claims.claim(f"{file.name}.{count}", total, lease_s)) is not None:
-            print(claim.index, claim.attempt, claim.trial_id, file=out)
+            print(claim.trial.number, claim.attempt, len(claim.trial.runs), file=out)
             count += 1
 
 

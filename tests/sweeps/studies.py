@@ -5,7 +5,7 @@ import json
 import math
 import random
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,8 @@ from optuna.study import StudyDirection
 from optuna.trial import TrialState, create_trial
 
 from deepracer_exp.config.sweep import SweepConfig, compose_sweep
+from deepracer_exp.sweeps.report.best import FreshLaps
+from deepracer_exp.sweeps.trial import SeedRun, Trial
 
 DISTRIBUTIONS: Mapping[str, BaseDistribution] = {
     "algorithm.lr": FloatDistribution(1e-5, 1e-3, log=True),
@@ -35,6 +37,9 @@ def settings(**changes) -> SweepConfig:
     return replace(_standard(), **{"startup_trials": 4, **changes})
 
 
+RUN_KEYS = {field.name for field in fields(SeedRun)}
+
+
 def new_study(
     runs_dir: Path, name: str = "lr_entropy", objectives: Sequence[str] = ("race_score",), **attrs: Any
 ) -> optuna.Study:
@@ -53,7 +58,7 @@ def new_study(
 def add(
     study: optuna.Study,
     values: Sequence[float] | None,
-    outcome: str = "converged",
+    ending: str = "converged",
     *,
     params: Mapping[str, Any] | None = None,
     distributions: Mapping[str, BaseDistribution] = DISTRIBUTIONS,
@@ -64,15 +69,18 @@ def add(
     """Add a trial, complete if it has values; `seen` is what a pruned one had, `metrics` the rows of its run."""
     number = len(study.get_trials(deepcopy=False))
     params = {"algorithm.lr": 1e-4, "algorithm.entropy_coeff": 0.01} if params is None else params
-    pruned = TrialState.FAIL if outcome == "failed" else TrialState.PRUNED
+    pruned = TrialState.FAIL if ending == "failed" else TrialState.PRUNED
     run_dir = Path(study.user_attrs["runs_dir"]) / study.study_name / f"run-{number}"
     if metrics:
-        write_metrics(run_dir, metrics, 1e4 if outcome == "not_learning" else 20.0 + 7 * (number % 8))
-    reason = f"{outcome.replace('_', ' ')}: for a reason"
-    attributes = {"slot": number, "outcome": outcome, "reason": reason, "attempt": 1}
-    attributes |= {"overrides": [f"{key}={value}" for key, value in params.items()], "run_dir": str(run_dir)}
-    attributes |= {"env_steps": 100_000, "wall_clock_s": 40.0, "lap_time_s": 9.5, "completion": 97.0}
-    attributes |= {"runs": [{"seed": 0, "run_dir": str(run_dir), "status": "finished", "value": values}]}
+        write_metrics(run_dir, metrics, 1e4 if ending == "not_learning" else 20.0 + 7 * (number % 8))
+    reason = f"{ending.replace('_', ' ')}: for a reason"
+    run = {"seed": 0, "run_dir": str(run_dir), "status": "finished", "ending": ending, "reason": reason}
+    run |= {"env_steps": 100_000, "wall_clock_s": 40.0, "lap_time_s": 9.5, "completion": 97.0}
+    run |= {"values": None if values is None else list(values)}
+    run |= {key: attrs.pop(key) for key in RUN_KEYS & attrs.keys()}
+    runs = attrs.pop("runs", (SeedRun(**run),))
+    attributes = Trial(number=number, runs=runs).attributes() | {"attempt": 1}
+    attributes |= {"overrides": [f"{key}={value}" for key, value in params.items()]}
     study.add_trial(
         create_trial(
             state=pruned if values is None else TrialState.COMPLETE,
@@ -84,6 +92,15 @@ def add(
         )
     )
     return number
+
+
+def fresh_laps(trial: int, value: float, **more: Any) -> dict[str, Any]:
+    """Return what a study stores of a trial's fresh laps."""
+    laps = FreshLaps(
+        trial=trial, values=[value], interval=[value - 0.5, value + 0.5],
+        lap_time_s=None, completion=50.0, held_out_completion=None,
+    )  # fmt: skip
+    return asdict(laps) | more
 
 
 def write_metrics(run_dir: Path, rows: int, lasts: float = 40.0) -> None:
@@ -116,10 +133,10 @@ def season(
             error = {"reason": "RunFailed: reward is NaN", "traceback": "Traceback\n  x"}
             add(study, None, "failed", params=params, **error)
         elif off > 0.9:
-            outcome = dice.choice(["not_learning", "collapsed", "median", "hyperband"])
+            ending = dice.choice(["not_learning", "collapsed", "median", "hyperband"])
             seen = dice.uniform(60, 100) if len(objectives) == 1 else None
             poor = {"completion": 20.0, "lap_time_s": None}
-            add(study, None, outcome, params=params, seen=seen, metrics=rows // 3, **poor)
+            add(study, None, ending, params=params, seen=seen, metrics=rows // 3, **poor)
         else:
             found = [values[name] for name in objectives]
             good = {"completion": completion, "held_out_completion": completion - 4, "lap_time_s": lap_s}

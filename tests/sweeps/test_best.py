@@ -17,9 +17,10 @@ from deepracer_exp.sweeps.report.best import (
     complete_trials,
     write_best,
 )
+from deepracer_exp.sweeps.trial import SeedRun
 from tests.conftest import refused
 
-from .studies import add, new_study, write_metrics
+from .studies import add, fresh_laps, new_study, write_metrics
 
 
 @pytest.mark.parametrize(
@@ -44,7 +45,7 @@ def test_on_fresh_laps_another_trial_may_win(tmp_path):
     study = new_study(tmp_path)
     for score in (9.0, 9.1, 12.0):
         add(study, [score])
-    study.set_user_attr("reranked", [{"trial": 0, "values": [9.8]}, {"trial": 1, "values": [9.3]}])
+    study.set_user_attr("reranked", [fresh_laps(0, 9.8), fresh_laps(1, 9.3)])
     assert (best_trial(study).number, best_values(study)) == (1, [9.3])
     study.set_user_attr("reranked_of", 3)
     assert (best_trial(study).number, best_values(study)) == (1, [9.3])
@@ -76,7 +77,7 @@ def test_a_shell_reads_every_override_back_from_the_command(tmp_path):
     add(study, [9.0], overrides=overrides)
     assert shlex.split(best_line(study)) == ["deepracer-exp", "train", *overrides]
     study.set_user_attr("parent", "best:spring")
-    study.set_user_attr("parent_run", ["run=/my runs/a", "checkpoint=40"])
+    study.set_user_attr("parent_run", {"run_dir": "/my runs/a", "checkpoint": 40})
     cloned = ["deepracer-exp", "clone", "/my runs/a", "checkpoint=40", *overrides]
     assert shlex.split(best_line(study)) == cloned
 
@@ -88,8 +89,8 @@ def with_runs(study, values):
     for seed, value in enumerate(values):
         run_dir = base / f"seed-{seed}"
         write_metrics(run_dir, 2)
-        runs.append({"seed": seed, "run_dir": str(run_dir), "status": "finished", "value": value})
-    add(study, [sum(value[0] for value in values) / len(values)], runs=runs)
+        runs.append(SeedRun(seed=seed, run_dir=str(run_dir), status="finished", values=value))
+    add(study, [sum(value[0] for value in values) / len(values)], runs=tuple(runs))
 
 
 def test_the_best_run_is_that_of_the_best_seed_wherever_all_runs_have_moved(tmp_path):

@@ -3,7 +3,8 @@
 import random
 import time
 
-from deepracer_exp.sweeps.queue.claims import TrialClaims, TrialResult
+from deepracer_exp.sweeps.queue.claims import TrialClaims
+from deepracer_exp.sweeps.trial import SeedRun, Trial
 from tests.waiting import wait_until
 
 from .racer import claim_all
@@ -12,8 +13,8 @@ THREE = ("anna", "ben", "cleo")
 HOUR_S = 3600.0
 
 
-def result(state="COMPLETE", values=None, **attrs) -> TrialResult:
-    return TrialResult(state=state, values=values, attrs=attrs)
+def result(state="COMPLETE", values=None, number=0, **run) -> Trial:
+    return Trial(number=number, state=state, values=values, runs=(SeedRun(seed=0, values=values, **run),))
 
 
 def _settle_all(claims: TrialClaims, total: int) -> None:
@@ -23,32 +24,31 @@ def _settle_all(claims: TrialClaims, total: int) -> None:
 
 def test_racing_processes_get_each_trial_once_and_take_over_each_expired_lease_once(url, claims, race):
     for owner in ("first", "second"):
-        claims.record(claim := claims.claim(owner, 24, HOUR_S), trial_id=40 + claim.index)
+        claims.record(claims.claim(owner, 24, HOUR_S), [SeedRun(seed=0)])
     for owner in ("first", "second"):
         assert claims.release(owner) == 1
     lines = race(claim_all, url, THREE, 24, HOUR_S).lines()
     claimed = {line for printed in lines for line in printed}
-    assert claimed == {"0 2 40", "1 2 41", *(f"{index} 1 None" for index in range(2, 24))}
+    assert claimed == {"0 2 1", "1 2 1", *(f"{number} 1 0" for number in range(2, 24))}
     assert sum(map(len, lines)) == 24
 
 
 def test_the_next_owner_gets_what_a_late_one_recorded_and_no_later_write_of_that_is_kept(claims):
     late = claims.claim("late", 1, 0.0)
-    runs = [{"seed": 1, "run_dir": "runs/ä", "status": "running", "value": None}]
-    assert claims.record(late, trial_id=3)
-    assert claims.record(late, runs=runs)
+    runs = (SeedRun(seed=1, run_dir="runs/ä"),)
+    assert claims.record(late, runs)
     heir = claims.claim("heir", 1, HOUR_S)
-    assert (heir.index, heir.attempt, heir.trial_id, heir.runs) == (0, 2, 3, tuple(runs))
-    claims.record(heir, trial_id=7, runs=[{"seed": 1}])
+    assert (heir.attempt, heir.trial) == (2, Trial(number=0, runs=runs))
+    claims.record(heir, [SeedRun(seed=1)])
     before = claims.all()
     assert not claims.renew(late, HOUR_S, {"completion": 100.0})
-    assert not claims.record(late, trial_id=8, runs=[])
-    assert not claims.settle(late, result(values=[1.0], outcome="finished"))
+    assert not claims.record(late, [])
+    assert not claims.settle(late, result(values=[1.0], ending="finished"))
     assert claims.release("late") == 0
     assert claims.all() == before
-    assert claims.settle(heir, result("PRUNED", outcome="collapsed"))
+    assert claims.settle(heir, result("PRUNED", ending="collapsed"))
     assert not claims.settle(late, result(values=[1.0]))
-    assert claims.all()[0].result.state == "PRUNED"
+    assert claims.all()[0].trial.state == "PRUNED"
 
 
 def test_a_lease_expires_by_itself_and_not_before(claims):
@@ -63,7 +63,7 @@ def test_a_lease_expires_by_itself_and_not_before(claims):
     assert claim.progress == {"completion": 12.5}
     heir = wait_until(lambda: claims.claim("heir", 1, HOUR_S), "claim")
     assert time.monotonic() - began > 0.95 * lease_s
-    assert (heir.index, heir.attempt) == (claim.index, 2)
+    assert (heir.trial.number, heir.attempt) == (claim.trial.number, 2)
 
 
 def test_an_owner_that_claims_again_gets_its_trial_again(claims):
@@ -75,15 +75,15 @@ def test_an_owner_that_claims_again_gets_its_trial_again(claims):
 
 def test_a_second_result_is_accepted_and_the_first_one_stays(claims):
     claim = claims.claim("one", 1, HOUR_S)
-    first = result(values=[12.5], outcome="finished")
+    first = result(values=[12.5], ending="finished")
     assert claims.settle(claim, first)
     assert claims.settle(claim, result("FAIL"))
     claims.mark_reported(0)
     assert claims.settle(claim, result("FAIL"))
     assert not claims.renew(claim, HOUR_S)
-    assert not claims.record(claim, trial_id=1)
+    assert not claims.record(claim, [])
     (stored,) = claims.all()
-    assert (stored.state, stored.result) == ("reported", first)
+    assert (stored.is_reported, stored.trial) == (True, first)
 
 
 def test_a_release_frees_the_trials_of_that_owner_only(claims):
@@ -92,7 +92,7 @@ def test_a_release_frees_the_trials_of_that_owner_only(claims):
     assert claims.release("gone") == 1
     assert claims.release("gone") == 0
     assert [one.expired for one in claims.all()] == [True, False]
-    assert claims.claim("heir", 2, HOUR_S).index == 0
+    assert claims.claim("heir", 2, HOUR_S).trial.number == 0
     assert claims.claim("other", 2, HOUR_S) is None
 
 
@@ -100,8 +100,8 @@ def test_a_result_waits_until_it_is_reported_to_optuna(claims):
     claim = claims.claim("one", 2, HOUR_S)
     claims.settle(claim, result(values=[1.0, 2.0], reason="x" * 70_000))
     (waiting,) = claims.unreported()
-    assert (waiting.index, waiting.result.values) == (0, [1.0, 2.0])
-    assert len(waiting.result.attrs["reason"]) == 70_000
+    assert (waiting.trial.number, waiting.trial.values) == (0, [1.0, 2.0])
+    assert len(waiting.trial.reason) == 70_000
     claims.mark_reported(0)
     claims.mark_reported(0)
     assert claims.unreported() == []
@@ -112,16 +112,16 @@ def test_a_result_waits_until_it_is_reported_to_optuna(claims):
 def test_a_finished_trial_is_never_claimed_again_and_the_total_may_change(claims):
     _settle_all(claims, 3)
     assert claims.claim("late", 3, HOUR_S) is None
-    assert claims.claim("late", 5, 0.0).index == 3
+    assert claims.claim("late", 5, 0.0).trial.number == 3
     assert claims.claim("next", 3, HOUR_S) is None, "beyond the total nothing is taken over"
     _settle_all(claims, 5)
-    assert [one.index for one in claims.all()] == [0, 1, 2, 3, 4]
+    assert [one.trial.number for one in claims.all()] == [0, 1, 2, 3, 4]
 
 
 def test_studies_of_one_database_share_no_claim(engine, claims):
     other = TrialClaims(engine, "other")
     mine, its = claims.claim("one", 1, HOUR_S), other.claim("one", 1, HOUR_S)
-    assert (mine.index, its.index) == (0, 0)
+    assert (mine.trial.number, its.trial.number) == (0, 0)
     assert other.settle(its, result("FAIL"))
     assert not claims.is_done(1)
     assert claims.renew(mine, HOUR_S)
@@ -135,11 +135,13 @@ def test_kills_in_the_middle_of_claiming_lose_and_double_no_trial(url, claims, r
         racers[number].kill()
     printed = {int(line.split()[0]) for lines in racers.lines() for line in lines if line.count(" ") == 2}
     found = claims.all()
-    assert [one.index for one in found] == list(range(total)), "the one that lives has claimed the rest"
+    assert [one.trial.number for one in found] == list(range(total)), (
+        "the one that lives has claimed the rest"
+    )
     assert printed <= set(range(total))
     for one in found:
         assert claims.release(one.owner) == 1
     _settle_all(claims, total)
-    assert [(one.index, one.attempt, one.state) for one in claims.all()] == [
-        (index, 2, "settled") for index in range(total)
+    assert [(one.trial.number, one.attempt) for one in claims.unreported()] == [
+        (number, 2) for number in range(total)
     ]

@@ -6,7 +6,7 @@ import pytest
 from optuna.distributions import CategoricalDistribution
 
 from deepracer_exp.sweeps.report.figures import FEWEST_COMPLETE, figures, narrowed, thinned
-from deepracer_exp.sweeps.report.labels import OUTCOMES, outcome_of, short_keys
+from deepracer_exp.sweeps.report.labels import ENDINGS, ending_of, short_keys
 
 from .studies import DISTRIBUTIONS, add, new_study
 
@@ -82,7 +82,7 @@ def test_several_objectives_have_a_figure_each_and_a_pareto_front(tmp_path):
 def test_the_entropy_of_each_run_is_drawn_under_its_outcome_up_to_its_end(study, drawn):
     found = {key: points for key, points in curves(drawn["entropy"]).items() if "best" not in key[0]}
     with_metrics = [trial for trial in study.trials if trial.state.name != "FAIL"]
-    assert set(found) == {(outcome_of(trial).replace("_", " "), trial.number) for trial in with_metrics}
+    assert set(found) == {(ending_of(trial).replace("_", " "), trial.number) for trial in with_metrics}
     assert {len(points) for points in found.values()} == {13, 40}
     assert all(points[-1][0] == 8192 * len(points) for points in found.values())
 
@@ -166,7 +166,7 @@ def lab(color, sight):
 
 @pytest.mark.parametrize("sight", SIGHTS)
 def test_two_outcomes_differ_in_colour_or_dash(sight):
-    for (_, one), (_, other) in itertools.combinations(OUTCOMES.items(), 2):
+    for (_, one), (_, other) in itertools.combinations(ENDINGS.items(), 2):
         apart = np.linalg.norm(lab(one.color, sight) - lab(other.color, sight))
         assert apart > 6, (one, other, apart)
         assert apart > 20 or one.dash != other.dash, (one, other, apart)

@@ -104,7 +104,7 @@ def test_a_sweep_continues_when_a_node_is_gone(two_nodes, start, tmp_path):
         if not known(tmp_path):
             return None
         pids = {process.pid for process in two_nodes.of_the_second()}
-        held = [claim for claim in claims(tmp_path) if claim.state == "claimed" and claim.progress]
+        held = [claim for claim in claims(tmp_path) if not claim.has_ended and claim.progress]
         return next((claim for claim in held if int(claim.owner.split(":")[-2]) in pids), None)
 
     lost = running.wait_for(held_by_the_second, "trial on the second node", PATIENCE_S)
@@ -112,7 +112,7 @@ def test_a_sweep_continues_when_a_node_is_gone(two_nodes, start, tmp_path):
     ended = running.end(240)
     assert ended.code == 0, ended.stderr
     assert_every_trial_is_accounted_for_once(tmp_path)
-    assert next(claim for claim in claims(tmp_path) if claim.index == lost.index).attempt > 1
+    assert next(claim for claim in claims(tmp_path) if claim.trial.number == lost.trial.number).attempt > 1
     assert not two_nodes.actors()
 
 
@@ -126,7 +126,7 @@ def test_ctrl_c_ends_the_workers_of_all_nodes_and_the_sweep_can_resume(two_nodes
     running.popen.send_signal(signal.SIGINT)
     assert running.end(240).code == 130
     assert not two_nodes.actors()
-    assert all(claim.expired or claim.result for claim in claims(tmp_path))
+    assert all(claim.expired or claim.has_ended for claim in claims(tmp_path))
     assert start("sweep", "study=s", "sweep.workers=2").end(240).code == 0
     assert_every_trial_is_accounted_for_once(tmp_path)
 

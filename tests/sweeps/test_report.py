@@ -8,10 +8,11 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.sweeps.report.labels import short_keys
 from deepracer_exp.sweeps.report.page import study_page, study_summary, write_study_page
 from deepracer_exp.sweeps.report.seeds import over_seeds
+from deepracer_exp.sweeps.trial import SeedRun, as_json
 from tests.browser import needs_chromium
 from tests.page_html import Html
 
-from .studies import add, new_study, season, write_metrics
+from .studies import add, fresh_laps, new_study, season, write_metrics
 
 
 def test_the_page_is_complete_and_loads_nothing(study, tmp_path):
@@ -64,7 +65,7 @@ def test_a_page_of_a_thousand_trials_of_many_parameters_stays_under_three_megaby
     write_metrics(tmp_path / "lr_entropy" / "run-0", 250)
     # All of them have the same curve, which saves a thousand files.
     for trial in study.get_trials(deepcopy=False):
-        trial.user_attrs["runs"] = [{"run_dir": str(tmp_path / "lr_entropy" / "run-0")}]
+        trial.user_attrs["runs"] = as_json([SeedRun(seed=0, run_dir=str(tmp_path / "lr_entropy" / "run-0"))])
     html = study_page(study)
     assert len(html.encode()) < 3_000_000
     assert "The last 700 in this order are left out" in Html(html).text
@@ -83,7 +84,7 @@ def test_nothing_that_a_study_holds_becomes_part_of_the_page(tmp_path):
         for score in (9.0, 10.0):
             add(study, [score], reason=word, overrides=[word], metrics=3)
         add(study, None, "failed", reason=word, traceback=word)
-        study.set_user_attr("reranked", [{"trial": 0, "values": [9.5], "interval": [9.0, 10.0]}])
+        study.set_user_attr("reranked", [fresh_laps(0, 9.5)])
     assert Html(study_page(nasty)).tags == Html(study_page(clean)).tags
     assert Html(study_page(nasty)).text.count(NASTY) >= 6
 
@@ -136,7 +137,7 @@ def test_the_winners_on_fresh_laps_have_an_interval_and_the_value_before(tmp_pat
     study = new_study(tmp_path)
     add(study, [9.0])
     add(study, [9.1])
-    again = [{"trial": 0, "values": [9.87], "interval": [9.61, 10.23]}, {"trial": 1, "values": [9.3]}]
+    again = [fresh_laps(0, 9.87, interval=[9.61, 10.23]), fresh_laps(1, 9.3)]
     study.set_user_attr("reranked", again)
     text = Html(study_page(study)).text
     assert "Trial 1 is the best: race score (usual and held-out) 9.30 s on fresh laps." in text
@@ -154,11 +155,8 @@ def test_a_page_that_cannot_be_written_leaves_the_old_one(study, tmp_path):
 
 
 def with_seeds(study, values, **more):
-    runs = [
-        {"seed": seed, "run_dir": None, "status": "finished", "value": [value]}
-        for seed, value in enumerate(values)
-    ]
-    return add(study, [sum(values) / len(values)], runs=runs, **more)
+    runs = [SeedRun(seed=seed, status="finished", values=[value]) for seed, value in enumerate(values)]
+    return add(study, [sum(values) / len(values)], runs=tuple(runs), **more)
 
 
 def test_trials_over_seeds_are_held_against_the_best_and_chance_is_called_that(tmp_path):

@@ -106,15 +106,15 @@ def test_workers_that_begin_together_try_different_values_and_the_same_at_each_s
 
 
 @pytest.mark.parametrize("name", ["tpe", "random", "qmc"])
-def test_a_trial_draws_by_its_index_whatever_its_number(name):
-    def drawn(others: int) -> dict:
+def test_a_trial_draws_by_its_number_whatever_became_of_those_before(name):
+    def drawn(earlier: TrialState) -> dict:
         study = optuna.create_study(sampler=build_sampler(settings(name), Space()))
-        for _ in range(others):
-            study.add_trial(create_trial(state=TrialState.FAIL))
-        study.add_trial(create_trial(state=TrialState.RUNNING, user_attrs={"slot": 7}))
+        for _ in range(3):
+            study.add_trial(create_trial(state=earlier))
+        study.add_trial(create_trial(state=TrialState.RUNNING))
         return Space().suggest(optuna.Trial(study, study.trials[-1]._trial_id))
 
-    assert drawn(others=0) == drawn(others=3)
+    assert drawn(TrialState.FAIL) == drawn(TrialState.RUNNING)
 
 
 def test_qmc_covers_every_key_evenly_however_many_workers_ask():

@@ -17,6 +17,7 @@ from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.sweeps.queue.claims import TrialClaims
 from deepracer_exp.sweeps.queue.storage import open_storage, patiently, resolve_database
 from deepracer_exp.sweeps.queue.study import load_study
+from deepracer_exp.sweeps.trial import SeedRun
 from tests.conftest import refused
 from tests.waiting import PATIENCE_S, wait_until
 
@@ -52,7 +53,7 @@ def test_a_process_killed_while_it_makes_the_tables_leaves_nothing_in_the_way(ur
     storage = open_storage(url, Path())
     study = optuna.create_study(study_name="study", storage=storage, load_if_exists=True)
     study.tell(study.ask(), 1.0)
-    assert TrialClaims(storage.engine, "study").claim("next", 1, HOUR_S).index == 0
+    assert TrialClaims(storage.engine, "study").claim("next", 1, HOUR_S).trial.number == 0
 
 
 @pytest.mark.parametrize(
@@ -186,7 +187,7 @@ def test_a_server_that_is_stopped_and_started_is_waited_for(postgres, how):
     postgres.stop(signal.Signals[how])
     calls = [
         lambda: claims.renew(claim, HOUR_S),
-        lambda: claims.record(claim, trial_id=trial._trial_id),
+        lambda: claims.record(claim, [SeedRun(seed=0)]),
         lambda: study.tell(trial, 1.0, skip_if_finished=True).state.name,
         lambda: open_storage(url, Path(), patience_s=HOUR_S).get_n_trials(study._study_id),
     ]
@@ -196,7 +197,7 @@ def test_a_server_that_is_stopped_and_started_is_waited_for(postgres, how):
         assert not any(one.done() for one in waiting)
         postgres.start()
         assert [one.result(PATIENCE_S) for one in waiting] == [True, True, "COMPLETE", 1]
-    assert claims.all()[0].trial_id == trial._trial_id
+    assert claims.all()[0].trial.runs == (SeedRun(seed=0),)
 
 
 def test_a_server_that_stays_away_ends_the_wait_in_one_line(postgres):
@@ -221,7 +222,7 @@ def test_a_locked_file_is_waited_for(tmp_path):
         patiently(lambda: claims.claim("one", 1, HOUR_S), 0.0)
     end = threading.Timer(0.5, lambda: other.execute("COMMIT"))
     end.start()
-    assert patiently(lambda: claims.claim("one", 1, HOUR_S), HOUR_S).index == 0
+    assert patiently(lambda: claims.claim("one", 1, HOUR_S), HOUR_S).trial.number == 0
     assert patiently(study.ask, HOUR_S).number == 0
     end.join()
     other.close()
@@ -232,7 +233,7 @@ def test_an_error_that_waiting_does_not_change_is_raised_at_once(tmp_path):
     claims = TrialClaims(storage.engine, "study")
     study = optuna.create_study(study_name="study", storage=storage)
     with storage.engine.begin() as connection:
-        connection.execute(sa.text("DROP TABLE deepracer_slots"))
+        connection.execute(sa.text("DROP TABLE deepracer_trials"))
         connection.execute(sa.text("DROP TABLE trials"))
     for call in (claims.all, study.ask):
         with pytest.raises(RunFailed, match="cannot be used: no such table"):

@@ -14,11 +14,14 @@ from deepracer_exp.errors import RunFailed
 from deepracer_exp.evaluation.race_protocol import Attempt
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, Group
 from deepracer_exp.runs.files import read_object
+from deepracer_exp.sweeps.queue.claims import Claim
 from deepracer_exp.sweeps.queue.driver import Driver
+from deepracer_exp.sweeps.queue.parent import Parent
 from deepracer_exp.sweeps.queue.storage import open_storage
 from deepracer_exp.sweeps.queue.worker import Interrupted
 from deepracer_exp.sweeps.search.space import SearchSpace
 from deepracer_exp.sweeps.sweep import _conclude, _parent, _without_rules, begin_study_run, interval_of
+from deepracer_exp.sweeps.trial import SeedRun, Trial
 from deepracer_exp.tracking.store import resolve_store
 from deepracer_exp.training.signals import Interruption
 
@@ -70,16 +73,18 @@ def test_impatient_is_entropy_that_decides_sooner_that_a_run_has_converged():
 def test_the_parent_is_resolved_when_a_study_is_begun_and_stays_the_same(trained):
     folder = trained().folder
     runs_dir = folder.parents[1]
-    request = compose_sweep(["study=p", "parent=best:tiny", LR])
+    request = compose_sweep(["study=p", "parent=best:tiny", f"runs_dir={runs_dir}", LR])
     best = read_object(folder / "summary.json")["best"]["iteration"]
-    found = _parent(request, runs_dir, None)
-    assert found == (f"run={folder.resolve()}", f"checkpoint={best}")
+    found = _parent(request, None)
+    assert found == Parent(str(folder.resolve()), best)
     # Something better, trained since, changes nothing for a study that has begun.
-    begun = SimpleNamespace(user_attrs={"parent": "best:tiny", "parent_run": ["run=/a", "checkpoint=3"]})
-    assert _parent(request, runs_dir, begun) == ("run=/a", "checkpoint=3")
+    begun = SimpleNamespace(
+        user_attrs={"parent": "best:tiny", "parent_run": {"run_dir": "/a", "checkpoint": 3}}
+    )
+    assert _parent(request, begun) == Parent("/a", 3)
     asks_for_another = SimpleNamespace(user_attrs=begun.user_attrs | {"parent": "best:other"})
-    assert _parent(request, runs_dir, asks_for_another) == found
-    assert _parent(compose_sweep(["study=p", LR]), runs_dir, None) == ()
+    assert _parent(request, asks_for_another) == found
+    assert _parent(compose_sweep(["study=p", LR]), None) is None
 
 
 def test_drivers_that_begin_at_once_share_one_run_in_mlflow(tmp_path):
@@ -132,10 +137,11 @@ def test_the_interval_of_a_race_score_holds_the_score_of_all_conditions():
 
 
 def test_the_same_error_of_several_runs_is_counted_as_one(tmp_path):
-    def failed(number: int) -> SimpleNamespace:
+    def failed(number: int) -> Claim:
         file = tmp_path.resolve() / f"20261122-12000{number}-seed0" / "metrics.jsonl"
-        attrs = {"reason": f"{file}: cannot be read"}
-        return SimpleNamespace(index=number, result=SimpleNamespace(state="FAIL", attrs=attrs))
+        runs = (SeedRun(seed=0, reason=f"{file}: cannot be read"),)
+        trial = Trial(number=number, state="FAIL", runs=runs)
+        return Claim(trial=trial, attempt=1, owner="a", is_reported=True, progress={}, expired=False)
 
     config = SimpleNamespace(config=SimpleNamespace(trials=9), folder=tmp_path, study="s")
     driver = Driver(

@@ -11,6 +11,7 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.runs.files import read_config, read_object
 from deepracer_exp.sweeps.queue.storage import open_storage
 from deepracer_exp.sweeps.report.best import best_line, best_run
+from deepracer_exp.sweeps.trial import Trial
 from tests.training.conftest import assert_same_run, workers_start_early  # noqa: F401 - a fixture
 
 TINY = (
@@ -137,7 +138,7 @@ def test_when_all_trials_fail_the_sweep_ends_early_with_their_error(start, tmp_p
     states = [trial.state for trial in load(tmp_path, "f").trials]
     assert states.count(TrialState.FAIL) >= 3
     assert TrialState.PRUNED not in states
-    assert all("ZeroDivisionError" in t.user_attrs["traceback"] for t in load(tmp_path, "f").trials[:3])
+    assert all("ZeroDivisionError" in Trial.of(t).traceback for t in load(tmp_path, "f").trials[:3])
     failed = states.count(TrialState.FAIL)
     again = start("sweep", "study=f").end()
     assert again.code == 3, again.stderr

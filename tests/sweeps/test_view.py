@@ -5,21 +5,22 @@ from types import SimpleNamespace
 
 from rich.console import Console
 
-from deepracer_exp.sweeps.queue.claims import Claim, TrialResult
+from deepracer_exp.sweeps.queue.claims import Claim
 from deepracer_exp.sweeps.report.view import SweepView
+from deepracer_exp.sweeps.trial import SeedRun, Trial
 
 CONFIG = SimpleNamespace(trials=4, objectives=("race_score",))
 WORKER_CONFIG = SimpleNamespace(study="spring", config=CONFIG, folder="runs/spring")
 
 
 def claim(number, state=None, values=None, share=0.0, params=None, **attrs):
-    progress = {"number": number, "env_steps": 8192, "completion": 51.0, "entropy": 2.31}
+    progress = {"env_steps": 8192, "completion": 51.0, "entropy": 2.31}
     progress |= {"share": share, "params": params or {}}
-    result = state and TrialResult(state=state, values=values, attrs={"number": number, **attrs})
+    runs = (SeedRun(seed=0, values=values, **attrs),) if state else ()
+    trial = Trial(number=number, state=state or "RUNNING", values=values, runs=runs)
     return Claim(
-        index=number, attempt=1, owner="host:1:a", state="reported" if state else "claimed",
-        result=result, trial_id=number, runs=(), progress=progress, expired=False,
-    )  # fmt: skip
+        trial=trial, attempt=1, owner="host:1:a", is_reported=bool(state), progress=progress, expired=False
+    )
 
 
 def shown(claims, is_terminal=True, first=(), after_s=0.0):
@@ -33,12 +34,12 @@ def shown(claims, is_terminal=True, first=(), after_s=0.0):
 
 
 ENDED = [
-    claim(0, "COMPLETE", [8.25], outcome="converged", env_steps=8192, lap_time_s=8.1, completion=98.0),
-    claim(1, "PRUNED", None, outcome="collapsed", env_steps=4096, reason="collapsed: entropy 0.01"),
+    claim(0, "COMPLETE", [8.25], ending="converged", env_steps=8192, lap_time_s=8.1, completion=98.0),
+    claim(1, "PRUNED", None, ending="collapsed", env_steps=4096, reason="collapsed: entropy 0.01"),
 ]
 
 
-def test_it_counts_trials_by_outcome_and_names_the_best():
+def test_it_counts_trials_by_state_and_names_the_best():
     view = shown([*ENDED, claim(2)])
     for words in (
         "2 of 4: 1 done, 1 pruned, 0 failed",
@@ -61,7 +62,7 @@ def test_it_shows_the_values_of_a_trial_from_its_start_on():
     params = {"algorithm.lr": 0.00031234, "network": "mlp_small"}
     begun = claim(2)
     begun.progress.clear()
-    begun.progress.update(number=2, params=params, share=0.0)
+    begun.progress.update(params=params, share=0.0)
     for view in (shown([begun]), shown([claim(2, params=params)])):
         assert "lr 0.000312" in view
         assert "mlp_small" in view

@@ -10,12 +10,13 @@ from optuna.trial import FrozenTrial, TrialState
 
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment
 from deepracer_exp.config.sweep import compose_sweep
-from deepracer_exp.sweeps.queue.claims import TrialClaims, TrialResult
+from deepracer_exp.sweeps.queue.claims import TrialClaims
 from deepracer_exp.sweeps.queue.storage import open_storage
 from deepracer_exp.sweeps.queue.study import open_study
 from deepracer_exp.sweeps.queue.worker import TrialRun, Worker
 from deepracer_exp.sweeps.queue.worker_config import WorkerConfig
 from deepracer_exp.sweeps.search.space import SearchSpace
+from deepracer_exp.sweeps.trial import Trial
 from deepracer_exp.training import callbacks
 from deepracer_exp.training.signals import Interruption
 
@@ -32,14 +33,14 @@ def worker(tmp_path, *asked: str) -> tuple[Worker, RDBStorage]:
     request = compose_sweep([*overrides, "study=s"])
     space = SearchSpace.from_request(request)
     storage = open_storage(None, tmp_path)
-    open_study(request, overrides, space, (), storage, tmp_path)
+    open_study(request, overrides, space, None, storage, tmp_path)
     config = WorkerConfig(
         study="s",
         runs_dir=tmp_path,
         config=request.entry.sweep,
         protocol=compose_evaluation(["run=any", "evaluation=sweep"])[0].evaluation,
         space=space,
-        parent=(),
+        parent=None,
         store=None,
         study_run_id=None,
         evaluations=None,
@@ -48,14 +49,13 @@ def worker(tmp_path, *asked: str) -> tuple[Worker, RDBStorage]:
     return Worker(config, storage, "host:1:a"), storage
 
 
+def untrained(self: TrialRun, overrides) -> Trial:
+    return self._as_trial("COMPLETE", [9.0 + len(overrides)])
+
+
 def made(tmp_path, monkeypatch, *asked: str) -> list[FrozenTrial]:
     """Make the trials of a sweep, with nearly the same values and without training."""
-
-    def untrained(self: TrialRun, overrides) -> TrialResult:
-        attrs = {"overrides": overrides, "reason": "made up"}
-        return TrialResult(state="COMPLETE", values=[9.0 + len(overrides)], attrs=attrs)
-
-    monkeypatch.setattr(TrialRun, "_result", untrained)
+    monkeypatch.setattr(TrialRun, "_ended", untrained)
     one, storage = worker(tmp_path, *asked, "sweep.startup_trials=2")
     one.work(Interruption())
     return optuna.load_study(study_name="s", storage=storage).trials
@@ -81,6 +81,21 @@ def test_values_drawn_again_are_trained_with_the_next_seed(tmp_path, monkeypatch
         assert found == [7 + 2 * again for again in range(len(found))]
 
 
+def test_a_worker_lost_before_it_created_its_trial_leaves_no_gap_and_changes_no_value(tmp_path, monkeypatch):
+    asked = ("algorithm.lr=interval(1e-5,1e-3)", "sweep.sampler=random", "sweep.trials=4")
+    undisturbed = made(tmp_path / "undisturbed", monkeypatch, *asked)
+    one, storage = worker(tmp_path / "disturbed", *asked)
+    claims = TrialClaims(storage.engine, "s")
+    assert claims.claim("host:2:lost", 4, 3600.0).trial.number == 0
+    late = SimpleNamespace(sleep=lambda _: claims.release("host:2:lost"), monotonic=time.monotonic)
+    monkeypatch.setattr("deepracer_exp.sweeps.queue.worker.time", late)
+    one.work(Interruption())
+    trials = optuna.load_study(study_name="s", storage=storage).trials
+    assert [claim.attempt for claim in claims.all()] == [2, 1, 1, 1]
+    assert [Trial.of(trial) for trial in trials] == [claim.trial for claim in claims.all()]
+    assert [trial.params for trial in trials] == [trial.params for trial in undisturbed]
+
+
 def test_a_run_whose_trial_is_taken_over_while_its_pictures_are_drawn_has_no_end(tmp_path, monkeypatch):
     one, storage = worker(
         tmp_path,
@@ -103,4 +118,4 @@ def test_a_run_whose_trial_is_taken_over_while_its_pictures_are_drawn_has_no_end
     (run,) = (tmp_path / "s").glob("*-seed*")
     assert (run / "metrics.jsonl").is_file()
     assert not (run / "summary.json").exists()
-    assert [claim.state for claim in claims.all()] == ["claimed"]
+    assert [claim.has_ended for claim in claims.all()] == [False]

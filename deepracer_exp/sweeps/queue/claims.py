@@ -13,8 +13,8 @@ import logging
 import random
 import threading
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import sqlalchemy as sa
@@ -23,34 +23,36 @@ from optuna.storages import BaseStorage
 from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.exc import DBAPIError, IntegrityError
 
+from deepracer_exp.sweeps.trial import SeedRun, Trial, as_json, as_runs
+
 from .storage import DOWN, patiently
 
 _log = logging.getLogger("deepracer_exp")
 
-_TABLE = "deepracer_slots"
-_CLAIMED, _SETTLED, _REPORTED = "claimed", "settled", "reported"
+TABLE = "deepracer_trials"
 _RELEASED = 0.0
 _RENEWALS = 12
 """Renewals within one lease; the live view is at most one of them behind."""
 
 _table = sa.Table(
-    _TABLE,
+    TABLE,
     sa.MetaData(),
     # The longest study name that Optuna allows.
     sa.Column("study", sa.String(512), primary_key=True),
-    sa.Column("slot", sa.Integer, primary_key=True, autoincrement=False),
+    sa.Column("number", sa.Integer, primary_key=True, autoincrement=False),
     sa.Column("attempt", sa.Integer, nullable=False),
     sa.Column("owner", sa.String(255), nullable=False),
-    sa.Column("state", sa.String(16), nullable=False),
+    # Of Optuna; null until the trial has its result.
+    sa.Column("state", sa.String(16)),
+    sa.Column("is_reported", sa.Boolean, nullable=False),
     sa.Column("expires_s", sa.Double, nullable=False),
-    sa.Column("trial_id", sa.Integer),
     sa.Column("runs", sa.Text),
     sa.Column("progress", sa.Text),
-    sa.Column("outcome", sa.String(16)),
     sa.Column("objective_values", sa.Text),
-    sa.Column("attrs", sa.Text),
 )
 _of = _table.c
+_is_held = _of.state.is_(None)
+_waits_for_optuna = sa.and_(_of.state.is_not(None), _of.is_reported.is_(sa.false()))
 
 # Seconds since 1970 by the clock of the database, so that the clocks of the machines do not matter. Read when the row
 # is evaluated and not when the transaction begins, because a transaction may wait for another process in between.
@@ -61,35 +63,23 @@ _CLOCKS = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrialResult:
-    """The result of a trial."""
-
-    state: str
-    """Name of Optuna's state: COMPLETE, PRUNED or FAIL."""
-    values: list[float] | None
-    """One per objective; None unless complete."""
-    attrs: dict[str, Any]
-    """User attributes of the trial."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Claim:
     """One row of the table: a trial, the worker that owns it, and what earlier owners left."""
 
-    index: int
-    """Place of the trial in the study, from 0; Optuna's number differs where a worker died while it created one."""
+    trial: Trial
     attempt: int
     """1 for the first owner, one more for each takeover."""
     owner: str
-    state: str
-    """`claimed`, `settled` (has its result) or `reported` (Optuna has it, too)."""
-    result: TrialResult | None
-    trial_id: int | None
-    """Optuna's id of the trial."""
-    runs: tuple[dict[str, Any], ...]
+    is_reported: bool
+    """Whether Optuna has the result of the trial."""
     progress: dict[str, Any]
     expired: bool
     """Whether the lease has run out, so that any worker may take the trial over."""
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the trial has its result."""
+        return self.trial.state != "RUNNING"
 
 
 class TrialClaims:
@@ -104,13 +94,13 @@ class TrialClaims:
         self.study = study
         self._engine = engine
         self._now = sa.literal_column(_CLOCKS[engine.dialect.name], sa.Double)
-        if sa.inspect(engine).has_table(_TABLE):
+        if sa.inspect(engine).has_table(TABLE):
             return
         try:
             _table.create(engine)
         except DBAPIError:
             # Another process was faster; each database reports that in its own way.
-            if not sa.inspect(engine).has_table(_TABLE):
+            if not sa.inspect(engine).has_table(TABLE):
                 raise
 
     def claim(self, owner: str, total: int, lease_s: float) -> Claim | None:
@@ -131,8 +121,8 @@ class TrialClaims:
             if not free:
                 return None
             # In order; workers that raced for the same trial spread out.
-            index = random.choice(free[: 1 + 2 * lost])
-            if (claim := self._begin(index, owner, lease_s)) is not None:
+            number = random.choice(free[: 1 + 2 * lost])
+            if (claim := self._begin(number, owner, lease_s)) is not None:
                 return claim
             lost += 1
 
@@ -148,43 +138,34 @@ class TrialClaims:
     def record(
         self,
         claim: Claim,
-        *,
-        trial_id: int | None = None,
-        runs: list[dict[str, Any]] | None = None,
+        runs: Sequence[SeedRun],
         progress: Mapping[str, Any] | None = None,
     ) -> bool:
-        """Record what a later owner must know; return False if another worker has taken the trial over."""
-        values: dict[sa.Column[Any], Any] = {}
-        if trial_id is not None:
-            values[_of.trial_id] = trial_id
-        if runs is not None:
-            values[_of.runs] = json.dumps(runs)
-        if progress is not None:
-            values[_of.progress] = json.dumps(dict(progress))
-        return self._update_held(claim, values)
+        """Record the runs for a later owner; return False if another worker has taken the trial over."""
+        more = {} if progress is None else {_of.progress: json.dumps(dict(progress))}
+        return self._update_held(claim, {_of.runs: json.dumps(as_json(runs)), **more})
 
-    def settle(self, claim: Claim, result: TrialResult) -> bool:
+    def settle(self, claim: Claim, ended: Trial) -> bool:
         """Store the result of a trial; return False if another worker has taken the trial over.
 
         Repeated calls return True and the first result stays.
         """
         values = {
-            _of.state: _SETTLED,
-            _of.outcome: result.state,
-            _of.objective_values: json.dumps(result.values),
-            _of.attrs: json.dumps(result.attrs),
+            _of.state: ended.state,
+            _of.objective_values: json.dumps(ended.values),
+            _of.runs: json.dumps(as_json(ended.runs)),
         }
         return self._update_held(claim, values, settled=True)
 
     def unreported(self) -> list[Claim]:
         """Return the claims whose result Optuna does not have yet."""
-        return [_as_claim(row) for row in self._rows(_of.state == _SETTLED)]
+        return [_as_claim(row) for row in self._rows(_waits_for_optuna)]
 
-    def mark_reported(self, index: int) -> None:
+    def mark_reported(self, number: int) -> None:
         """Record that Optuna has the result of a trial."""
         with self._engine.begin() as connection:
-            where = (_of.slot == index, _of.state == _SETTLED)
-            connection.execute(self._statement({_of.state: _REPORTED}, *where))
+            where = (_of.number == number, _waits_for_optuna)
+            connection.execute(self._statement({_of.is_reported: True}, *where))
 
     def release(self, owner: str, *, is_lost: bool = False) -> int:
         """End the leases of an owner that is gone or about to end; return their number.
@@ -192,96 +173,96 @@ class TrialClaims:
         If its process died unasked (`is_lost`), perhaps because of its trial, the attempts at its run stay counted;
         otherwise they start again from zero.
         """
-        where = (_of.owner == owner, _of.state == _CLAIMED, _of.expires_s > _RELEASED)
+        where = (_of.owner == owner, _is_held, _of.expires_s > _RELEASED)
         with self._engine.begin() as connection:
             mine = connection.execute(self._select(*where)).all()
             for row in mine:
-                runs = [run if is_lost else {**run, "tries": 0} for run in _runs(row)]
-                values = {_of.expires_s: _RELEASED, _of.runs: json.dumps(runs)}
-                connection.execute(self._statement(values, _of.slot == row.slot, *where))
+                runs = [run if is_lost else replace(run, tries=0) for run in _runs(row)]
+                values = {_of.expires_s: _RELEASED, _of.runs: json.dumps(as_json(runs))}
+                connection.execute(self._statement(values, _of.number == row.number, *where))
         return len(mine)
 
     def all(self) -> list[Claim]:
-        """Return every claim ever made, by index."""
+        """Return every claim ever made, by the number of the trial."""
         return [_as_claim(row) for row in self._rows()]
 
     def is_done(self, total: int) -> bool:
         """Return whether the first `total` trials have their results."""
         ended = sa.select(sa.func.count()).where(
-            _of.study == self.study, _of.slot < total, _of.state != _CLAIMED
+            _of.study == self.study, _of.number < total, _of.state.is_not(None)
         )
         with self._engine.connect() as connection:
             return connection.execute(ended).scalar_one() >= total
 
     def _open_to(self, owner: str, total: int) -> tuple[list[sa.Row[Any]], list[int]]:
-        """Return the claims that an owner holds or may take over, and the indices of trials never claimed.
+        """Return the claims that an owner holds or may take over, and the numbers of trials never claimed.
 
         A worker without work asks every second, so this reads few rows however many the study has.
         """
-        within = (_of.study == self.study, _of.slot < total)
-        mine = (_of.state == _CLAIMED, sa.or_(_of.owner == owner, _of.expires_s <= self._now))
+        within = (_of.study == self.study, _of.number < total)
+        mine = (_is_held, sa.or_(_of.owner == owner, _of.expires_s <= self._now))
         with self._engine.connect() as connection:
-            rows = list(connection.execute(self._select(_of.slot < total, *mine)).all())
+            rows = list(connection.execute(self._select(_of.number < total, *mine)).all())
             if connection.execute(sa.select(sa.func.count()).where(*within)).scalar_one() >= total:
                 return rows, []
-            taken = set(connection.execute(sa.select(_of.slot).where(*within)).scalars())
-        return rows, [index for index in range(total) if index not in taken]
+            taken = set(connection.execute(sa.select(_of.number).where(*within)).scalars())
+        return rows, [number for number in range(total) if number not in taken]
 
     def _rows(self, *where: sa.ColumnElement[bool]) -> list[sa.Row[Any]]:
         with self._engine.connect() as connection:
             return list(connection.execute(self._select(*where)).all())
 
     def _select(self, *where: sa.ColumnElement[bool]) -> sa.Select[Any]:
-        expired = sa.and_(_of.state == _CLAIMED, _of.expires_s <= self._now).label("expired")
-        return sa.select(_table, expired).where(_of.study == self.study, *where).order_by(_of.slot)
+        expired = sa.and_(_is_held, _of.expires_s <= self._now).label("expired")
+        return sa.select(_table, expired).where(_of.study == self.study, *where).order_by(_of.number)
 
     def _statement(self, values: Mapping[Any, Any], *where: sa.ColumnElement[bool]) -> sa.Update:
         return sa.update(_table).where(_of.study == self.study, *where).values(dict(values))
 
-    def _begin(self, index: int, owner: str, lease_s: float) -> Claim | None:
+    def _begin(self, number: int, owner: str, lease_s: float) -> Claim | None:
         new = sa.insert(_table).values(
             study=self.study,
-            slot=index,
+            number=number,
             attempt=1,
             owner=owner,
-            state=_CLAIMED,
+            is_reported=False,
             expires_s=self._now + lease_s,
         )
         try:
             with self._engine.begin() as connection:
                 connection.execute(new)
-                return _as_claim(connection.execute(self._select(_of.slot == index)).one())
+                return _as_claim(connection.execute(self._select(_of.number == number)).one())
         except IntegrityError:
             return None
 
     def _take_over(self, seen: sa.Row[Any], owner: str, lease_s: float) -> Claim | None:
         taken = {_of.owner: owner, _of.attempt: seen.attempt + 1, _of.expires_s: self._now + lease_s}
         as_seen = (
-            _of.slot == seen.slot,
+            _of.number == seen.number,
             _of.attempt == seen.attempt,
             _of.owner == seen.owner,
-            _of.state == _CLAIMED,
+            _is_held,
             _of.expires_s <= self._now,
         )
         with self._engine.begin() as connection:
             connection.execute(self._statement(taken, *as_seen))
-            row = connection.execute(self._select(_of.slot == seen.slot)).one()
-        mine = (row.owner, row.attempt, row.state) == (owner, seen.attempt + 1, _CLAIMED)
+            row = connection.execute(self._select(_of.number == seen.number)).one()
+        mine = (row.owner, row.attempt, row.state) == (owner, seen.attempt + 1, None)
         return _as_claim(row) if mine else None
 
     def _update_held(self, claim: Claim, values: Mapping[Any, Any], *, settled: bool = False) -> bool:
         """Change a claim if its owner still holds it; return whether it does, and the trial has its result or not."""
         held = (
-            _of.slot == claim.index,
+            _of.number == claim.trial.number,
             _of.owner == claim.owner,
             _of.attempt == claim.attempt,
-            _of.state == _CLAIMED,
+            _is_held,
         )
         with self._engine.begin() as connection:
             if values:
                 connection.execute(self._statement(values, *held))
-            row = connection.execute(self._select(_of.slot == claim.index)).one()
-        return (row.owner, row.attempt) == (claim.owner, claim.attempt) and settled == (row.state != _CLAIMED)
+            row = connection.execute(self._select(_of.number == claim.trial.number)).one()
+        return (row.owner, row.attempt) == (claim.owner, claim.attempt) and settled == (row.state is not None)
 
 
 class Lease:
@@ -323,7 +304,7 @@ class Lease:
         if self._lost:
             from deepracer_exp.training.trainer import TakenOver  # which imports torch
 
-            raise TakenOver(f"trial {self.claim.index} was taken over")
+            raise TakenOver(f"trial {self.claim.trial.number} was taken over")
 
     def held(self, write: Callable[[], bool]) -> None:
         """Make a write that returns False if the claim is lost; raise as `confirm` does."""
@@ -346,36 +327,26 @@ class Lease:
                     return
             except DOWN as error:
                 # `confirm` waits for the database before anything is written.
-                _log.warning("lease of trial %d: %s", self.claim.index, type(error).__name__)
+                _log.warning("lease of trial %d: %s", self.claim.trial.number, type(error).__name__)
 
 
 def report_results(claims: TrialClaims, storage: BaseStorage) -> None:
     """Report to Optuna the results it does not have yet; the worker of one may have been killed before it could."""
+    study_id = storage.get_study_id_from_name(claims.study)
     for claim in claims.unreported():
-        assert claim.trial_id is not None
-        assert claim.result is not None
+        trial = claim.trial
+        trial_id = storage.get_trial_id_from_study_id_trial_number(study_id, trial.number)
         try:
-            for key, value in claim.result.attrs.items():
-                storage.set_trial_user_attr(claim.trial_id, key, value)
+            for key, value in {**trial.attributes(), "attempt": claim.attempt}.items():
+                storage.set_trial_user_attr(trial_id, key, value)
             # Not by a method of `Study`, which ends the process's study with the last point of a grid.
-            state, values = TrialState[claim.result.state], claim.result.values
+            state, values = TrialState[trial.state], trial.values
             if state == TrialState.PRUNED:
-                values = _last_value(storage.get_trial(claim.trial_id))
-            storage.set_trial_state_values(claim.trial_id, state, values)
+                values = _last_value(storage.get_trial(trial_id))
+            storage.set_trial_state_values(trial_id, state, values)
         except UpdateFinishedTrialError:
             pass  # another process was faster, with the same result
-        claims.mark_reported(claim.index)
-
-
-def fail_unclaimed_trials(claims: TrialClaims, storage: BaseStorage) -> None:
-    """Fail Optuna's running trials that no claim refers to: their workers were lost while they created them."""
-    known = {claim.trial_id for claim in claims.all()}
-    study_id = storage.get_study_id_from_name(claims.study)
-    for trial in storage.get_all_trials(study_id, deepcopy=False, states=(TrialState.RUNNING,)):
-        if trial._trial_id not in known:
-            storage.set_trial_user_attr(trial._trial_id, "outcome", "failed")
-            storage.set_trial_user_attr(trial._trial_id, "reason", "its worker was lost before it began")
-            storage.set_trial_state_values(trial._trial_id, TrialState.FAIL)
+        claims.mark_reported(trial.number)
 
 
 def _last_value(trial: FrozenTrial) -> list[float] | None:
@@ -383,23 +354,17 @@ def _last_value(trial: FrozenTrial) -> list[float] | None:
     return None if trial.last_step is None else [trial.intermediate_values[trial.last_step]]
 
 
-def _runs(row: sa.Row[Any]) -> tuple[dict[str, Any], ...]:
-    return tuple(json.loads(row.runs)) if row.runs else ()
+def _runs(row: sa.Row[Any]) -> tuple[SeedRun, ...]:
+    return as_runs(json.loads(row.runs or "[]"))
 
 
 def _as_claim(row: sa.Row[Any]) -> Claim:
-    result = None
-    if row.outcome is not None:
-        values = json.loads(row.objective_values) if row.objective_values else None
-        result = TrialResult(state=row.outcome, values=values, attrs=json.loads(row.attrs))
+    values = json.loads(row.objective_values or "null")
     return Claim(
-        index=row.slot,
+        trial=Trial(number=row.number, state=row.state or "RUNNING", values=values, runs=_runs(row)),
         attempt=row.attempt,
         owner=row.owner,
-        state=row.state,
-        result=result,
-        trial_id=row.trial_id,
-        runs=_runs(row),
-        progress=json.loads(row.progress) if row.progress else {},
+        is_reported=row.is_reported,
+        progress=json.loads(row.progress or "{}"),
         expired=bool(row.expired),
     )

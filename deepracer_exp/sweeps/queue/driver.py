@@ -51,7 +51,7 @@ class Driver:
         """Workers that died since a trial last ended."""
         self._ended = -1
         self._ended_before: frozenset[int] = frozenset()
-        """Places of the trials that ended before this start."""
+        """Numbers of the trials that ended before this start."""
 
     def run(self, interruption: Interruption) -> int | None:
         """Return when all trials are made: None, or the exit code when interrupted.
@@ -62,8 +62,8 @@ class Driver:
         self._config.folder.mkdir(parents=True, exist_ok=True)
         # Workers killed on this machine, mostly with their driver: their trials need not wait until a lease runs out.
         found = self._look()
-        self._ended_before = frozenset(one.index for one in found if one.result is not None)
-        for owner in {one.owner for one in found if one.result is None and is_gone(one.owner)}:
+        self._ended_before = frozenset(one.trial.number for one in found if one.has_ended)
+        for owner in {one.owner for one in found if not one.has_ended and is_gone(one.owner)}:
             self._release(owner)
         try:
             for _ in range(self._launcher.workers):
@@ -129,26 +129,26 @@ class Driver:
 
     def _look(self) -> list[Claim]:
         claims = patiently(self._claims.all, self._config.config.patience_s)
-        ended = sum(one.result is not None for one in claims)
+        ended = sum(one.has_ended for one in claims)
         if ended != self._ended:
             self._ended, self._losses = ended, 0
             self._on_ended(claims)
         return claims
 
     def _give_up_if_all_fail(self, claims: Sequence[Claim]) -> None:
-        ended = {one.index: one.result for one in claims if one.result is not None}
-        if any(result.state != "FAIL" for result in ended.values()):
+        ended = [one.trial for one in claims if one.has_ended]
+        if any(trial.state != "FAIL" for trial in ended):
             return
         # Failures of an earlier start do not count: their cause may be mended.
-        results = [result for index, result in ended.items() if index not in self._ended_before]
-        if len(results) < min(_FEW, self._config.config.trials - len(self._ended_before)):
+        failed = [trial for trial in ended if trial.number not in self._ended_before]
+        if len(failed) < min(_FEW, self._config.config.trials - len(self._ended_before)):
             return
         # The same error names the file of another run in each.
         folder = re.escape(str(self._config.folder.resolve())) + r"/[^/\s:]+"
-        reasons = collections.Counter(re.sub(folder, "RUN", str(one.attrs.get("reason"))) for one in results)
+        reasons = collections.Counter(re.sub(folder, "RUN", trial.reason) for trial in failed)
         ((reason, count),) = reasons.most_common(1)
         self._end()
-        raise RunFailed(f"all {len(results)} trials so far failed, {count} of them with: {reason}")
+        raise RunFailed(f"all {len(failed)} trials so far failed, {count} of them with: {reason}")
 
     def _end(self) -> None:
         """Ask the workers to end, and wait for them."""

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 import optuna
@@ -17,6 +18,8 @@ from deepracer_exp.sweeps import DEFAULT_FILE
 from deepracer_exp.sweeps.search.objectives import MEASURES
 from deepracer_exp.sweeps.search.space import SearchSpace
 
+from .claims import TABLE
+from .parent import Parent
 from .storage import open_storage
 
 MAY_DIFFER = (
@@ -29,11 +32,18 @@ _SAME = ("objectives", "seeds", "protocol", "parent")
 
 
 def find_study(name: str, storage: RDBStorage) -> Study | None:
-    """Return a study, None if none has that name."""
+    """Return a study, None if none has that name.
+
+    Raises:
+        BadInput: an earlier version, which stored trials in another way, began the study.
+    """
     try:
-        return optuna.load_study(study_name=name, storage=storage)
+        study = optuna.load_study(study_name=name, storage=storage)
     except KeyError:
         return None
+    if "space" in study.user_attrs and study.user_attrs.get("claims") != TABLE:
+        raise BadInput(f"study {name}: an earlier version began it, and alone can read it; give another name")
+    return study
 
 
 def load_study(name: str, storage: RDBStorage) -> Study:
@@ -88,11 +98,11 @@ def open_study(
     request: SweepRequest,
     overrides: Sequence[str],
     space: SearchSpace,
-    parent: Sequence[str],
+    parent: Parent | None,
     storage: RDBStorage,
     runs_dir: Path,
 ) -> Study:
-    """Begin a study, or open the one of that name; `parent` as of `WorkerConfig`.
+    """Begin a study, or open the study of that name; all trials are clones of `parent`, if there is one.
 
     Raises:
         BadInput: a study of that name exists, and its trials cannot be compared with these.
@@ -104,8 +114,9 @@ def open_study(
         "seeds": sweep.seeds,
         "protocol": sweep.protocol,
         "parent": request.entry.parent,
-        "parent_run": list(parent),
+        "parent_run": None if parent is None else asdict(parent),
         "runs_dir": str(runs_dir),
+        "claims": TABLE,
         # The address may contain a password, and is given again to resume.
         "overrides": [line for line in overrides if not line.lstrip("+").startswith("sweep.storage=")],
         # The last one: a study that has it has all of them.

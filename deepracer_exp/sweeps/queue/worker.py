@@ -4,12 +4,13 @@ import logging
 import time
 import traceback
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import optuna
 from optuna.storages import BaseStorage, RDBStorage
-from optuna.trial import FrozenTrial, TrialState
+from optuna.trial import FrozenTrial
 
 from deepracer_exp.agents.actor_critic import ActorCritic
 from deepracer_exp.config.compose import Composition, compose_experiment
@@ -37,24 +38,22 @@ from deepracer_exp.runs.result import FAILED, FINISHED, INTERRUPTED, STOPPED_EAR
 from deepracer_exp.sweeps.search.objectives import intermediate_value, values_of
 from deepracer_exp.sweeps.search.pruners import FirstOf, PruneDecision, build_pruner, is_worse_across_seeds
 from deepracer_exp.sweeps.search.samplers import build_sampler
+from deepracer_exp.sweeps.trial import SeedRun, Trial, as_json
 from deepracer_exp.tracking.metadata import PARENT, STUDY
 from deepracer_exp.tracking.metrics import trial_metrics
 from deepracer_exp.tracking.study_run import TRIAL, end_trial_run, open_trial_run
 from deepracer_exp.tracking.tracking_file import Status
 from deepracer_exp.training.budget import RunEnded
-from deepracer_exp.training.clone import prepare_clone
 from deepracer_exp.training.run import copy_run, resume, run_training
 from deepracer_exp.training.signals import Interruption
 from deepracer_exp.training.trainer import Callback, TakenOver, Trainer, TrainResult
 
-from .claims import Claim, Lease, TrialClaims, TrialResult, report_results
-from .storage import patiently
+from .claims import Claim, Lease, TrialClaims, report_results
+from .storage import patiently, resolve_database
 from .worker_config import WorkerConfig
 
 Value = TypeVar("Value")
 Start = tuple[ActorCritic, Lineage]
-Run = dict[str, Any]
-"""A run of a trial, as the claim stores it for a later owner."""
 
 _log = logging.getLogger("deepracer_exp")
 
@@ -62,6 +61,8 @@ _WAIT_S = 1.0
 """Between two attempts to claim a trial: another worker's lease may run out."""
 _MOST_TRIES = 3
 """How often a run is started or resumed at the same checkpoint if its process is lost each time."""
+_STATES = {FAILED: "FAIL", STOPPED_EARLY: "PRUNED"}
+"""Optuna's state of a trial whose last run has this status; other runs are complete."""
 _SHOWN = ("iteration", "env_steps", "completion", "entropy", "eval_completion", "eval_lap_time_s")
 """Columns of metrics.jsonl for the live view."""
 
@@ -77,6 +78,7 @@ class Worker:
         """Connect to the study; `owner` is this worker's name."""
         self._config, self._storage, self._owner = config, storage, owner
         self._claims = TrialClaims(storage.engine, config.study)
+        self._database = resolve_database(config.config.storage, config.runs_dir)
         self._patience_s = config.config.patience_s
 
     def work(self, interruption: Interruption) -> None:
@@ -100,8 +102,8 @@ class Worker:
     def _make(self, claim: Claim) -> None:
         with Lease(self._claims, claim, self._config.config.lease_s, self._patience_s) as lease:
             try:
-                result = self._result(lease)
-                lease.held(lambda: self._claims.settle(claim, result))
+                ended = self._ended(lease)
+                lease.held(lambda: self._claims.settle(claim, ended))
             except TakenOver as error:
                 _log.warning("%s", error)
                 return
@@ -109,14 +111,15 @@ class Worker:
                 return
         self._patiently(lambda: report_results(self._claims, self._storage))
 
-    def _result(self, lease: Lease) -> TrialResult:
+    def _ended(self, lease: Lease) -> Trial:
         sampler = build_sampler(self._config.config, self._config.space)
         pruner = build_pruner(self._config.config, self._config.evaluations)
         name, storage = self._config.study, self._storage
         study = self._patiently(
             lambda: optuna.load_study(study_name=name, storage=storage, sampler=sampler, pruner=pruner)
         )
-        trial_id = self._trial_id(lease)
+        lease.confirm()
+        trial_id = self._patiently(lambda: self._trial_id(lease.claim.trial.number))
         run = self._patiently(lambda: TrialRun(self._config, self._claims, lease, study, storage, trial_id))
         try:
             return run.make()
@@ -129,22 +132,18 @@ class Worker:
             # A bug of ours ends this trial, with its traceback, and not the others.
             return run.failed(f"{type(error).__name__}: {error}", traceback.format_exc())
 
-    def _trial_id(self, lease: Lease) -> int:
-        """Return the id of the claim's trial in Optuna; create the trial if there is none.
+    def _trial_id(self, number: int) -> int:
+        """Return Optuna's id of a trial; create the trials up to it that do not exist.
 
-        A trial that is created and not recorded, because its worker is killed in between, is failed at the end of the
-        sweep: Optuna is never asked which trials there are.
+        A worker that is killed before it creates its trial leaves no gap, so that a trial has the same number here and
+        in Optuna: the next worker creates both.
         """
-        if lease.claim.trial_id is not None:
-            return lease.claim.trial_id
-        lease.confirm()
-        storage, index = self._storage, lease.claim.index
-        template = optuna.trial.create_trial(state=TrialState.RUNNING, user_attrs={"slot": index})
-        trial_id = self._patiently(
-            lambda: storage.create_new_trial(storage.get_study_id_from_name(self._config.study), template)
-        )
-        lease.held(lambda: self._claims.record(lease.claim, trial_id=trial_id))
-        return trial_id
+        study_id = self._storage.get_study_id_from_name(self._config.study)
+        if self._storage.get_n_trials(study_id) <= number:
+            with self._database.creation_lock(self._storage.engine):
+                for _ in range(self._storage.get_n_trials(study_id), number + 1):
+                    self._storage.create_new_trial(study_id)
+        return self._storage.get_trial_id_from_study_id_trial_number(study_id, number)
 
     def _patiently(self, call: Callable[[], Value]) -> Value:
         return patiently(call, self._patience_s)
@@ -172,14 +171,14 @@ class TrialRun(Callback):
         self._study, self._storage, self._trial_id = study, storage, trial_id
         self._trial = optuna.trial.Trial(study, trial_id)
         self._number = self._trial.number
-        self._runs: list[Run] = [dict(run) for run in lease.claim.runs]
+        self._runs = list(lease.claim.trial.runs)
         self._seed = 0
         """Index of the present run."""
         self._pruned_by: str | None = None
         self._parent_run_id: str | None = None
         """MLflow's id of the run above those of the trial."""
 
-    def make(self) -> TrialResult:
+    def make(self) -> Trial:
         """Make what is missing of the trial.
 
         Raises:
@@ -189,16 +188,16 @@ class TrialRun(Callback):
         """
         overrides = self._overrides()
         self._parent_run_id = self._mlflow_parent(overrides)
-        result = self._result(overrides)
-        self._track(result)
-        return result
+        ended = self._ended(overrides)
+        self._track(ended)
+        return ended
 
-    def failed(self, reason: str, trace: str) -> TrialResult:
-        """Return the result of a trial that failed outside its runs."""
-        run = {"seed": self._seed, "run_dir": None, "value": None, "env_steps": 0, "wall_clock_s": 0.0}
-        run |= self._runs[self._seed] if self._seed < len(self._runs) else {}
-        self._runs[self._seed :] = [_as_failed(run, reason, trace or reason)]
-        return self._with_attrs("FAIL", None, self._trial.user_attrs.get("overrides", []))
+    def failed(self, reason: str, trace: str) -> Trial:
+        """Return a trial that failed outside its runs."""
+        self._runs[self._seed :] = [
+            _as_failed(self._run or SeedRun(seed=self._seed), reason, trace or reason)
+        ]
+        return self._as_trial("FAIL")
 
     def on_run_created(self, trainer: Trainer) -> None:
         """Record where the run lies, before it is recorded anywhere else."""
@@ -225,49 +224,47 @@ class TrialRun(Callback):
 
     def _begin(self, run_dir: Path) -> None:
         self._show(0.0, {})
-        run = {"seed": self._seed, "run_dir": str(run_dir.resolve()), "status": None, "value": None}
-        known = self._runs[self._seed] if self._seed < len(self._runs) else {}
-        self._record(run | {key: known[key] for key in ("tries", "tried_at") if key in known})
+        tried = self._run or SeedRun(seed=self._seed)
+        folder = str(run_dir.resolve())
+        self._record(SeedRun(seed=self._seed, run_dir=folder, tries=tried.tries, tried_at=tried.tried_at))
         # The report draws the curves of running trials.
-        self._patiently(lambda: self._trial.set_user_attr("run_dir", run["run_dir"]))
+        self._patiently(lambda: self._trial.set_user_attr("runs", as_json(self._runs)))
 
     def _show(self, spent: float, row: dict[str, Any]) -> None:
         """Set what the live view shows, after this share of the present run's budget."""
         share = (self._seed + min(spent, 1.0)) / self._config.config.seeds
-        known = {"number": self._number, "params": self._trial.params, "share": share}
-        self._lease.progress = {**row, **known}
+        self._lease.progress = {**row, "params": self._trial.params, "share": share}
 
     def _asked(self, value: float) -> PruneDecision | None:
         """Report an evaluation to Optuna, and return what the pruners decide."""
         if len(self._config.config.objectives) > 1:
             return None  # Optuna compares trials by one number only.
-        rows = _rows(Path(self._runs[0]["run_dir"]))
+        rows = _rows(Path(self._runs[0].run_dir or ""))
         step = 1 + sum(row["eval_completion"] is not None for row in rows)
         if step not in self._storage.get_trial(self._trial_id).intermediate_values:
             self._trial.report(value, step)
         assert isinstance(self._study.pruner, FirstOf)
         return self._study.pruner.decide(self._study, self._storage.get_trial(self._trial_id))
 
-    def _result(self, overrides: list[str]) -> TrialResult:
+    def _ended(self, overrides: list[str]) -> Trial:
         config = self._config.config
-        for index in range(config.seeds):
-            self._seed = index
-            run = self._runs[index] if index < len(self._runs) else None
-            if run is None or run["status"] is None:
-                run = self._made(index, overrides)
-            if run["status"] == FAILED:
-                return self._with_attrs("FAIL", None, overrides)
-            if run["status"] == STOPPED_EARLY:
-                return self._with_attrs("PRUNED", None, overrides)
-            so_far = [run["value"][0] for run in self._runs]
+        for seed in range(config.seeds):
+            self._seed = seed
+            if self._run is None or self._run.status is None:
+                self._record(self._made(overrides))
+            run = self._runs[seed]
+            if run.status in _STATES:
+                return self._as_trial(_STATES[run.status])
+            so_far = [run.values[0] for run in self._runs if run.values]
             is_last = len(so_far) == config.seeds
             if not is_last and "wilcoxon" in config.pruners and is_worse_across_seeds(self._study, so_far):
                 reason = f"worse than the best trial on {len(so_far)} seeds"
-                run |= {"outcome": "wilcoxon", "reason": reason}
-                return self._with_attrs("PRUNED", None, overrides)
-        by_seed = [run["value"] for run in self._runs]
-        values = [sum(column) / len(column) for column in zip(*by_seed, strict=True)]
-        return self._with_attrs("COMPLETE", values, overrides)
+                self._runs[seed] = replace(run, ending="wilcoxon", reason=reason)
+                return self._as_trial("PRUNED")
+        by_seed = [run.values for run in self._runs if run.values]
+        return self._as_trial(
+            "COMPLETE", [sum(column) / len(column) for column in zip(*by_seed, strict=True)]
+        )
 
     def _overrides(self) -> list[str]:
         """Return the trial as overrides of `deepracer-exp train` (of a clone: `clone`)."""
@@ -278,57 +275,55 @@ class TrialRun(Callback):
         # of them, and not every sampler reads them.
         trials = self._patiently(lambda: self._study.get_trials(deepcopy=False))
         drawn = self._patiently(lambda: self._config.space.suggest(self._trial))
-        overrides = self._with_own_seed(drawn, [one for one in trials if one.number < self._number])
+        overrides = self._with_own_seed(drawn, [trial for trial in trials if trial.number != self._number])
         self._lease.confirm()
         self._patiently(lambda: self._trial.set_user_attr("drawn", drawn))
         self._patiently(lambda: self._trial.set_user_attr("overrides", overrides))
         return overrides
 
-    def _with_own_seed(self, drawn: list[str], earlier: Sequence[FrozenTrial]) -> list[str]:
-        """Return what was drawn, with the next seed if an earlier trial drew the same: it would be the same run."""
-        again = sum(trial.user_attrs.get("drawn") == drawn for trial in earlier)
+    def _with_own_seed(self, drawn: list[str], others: Sequence[FrozenTrial]) -> list[str]:
+        """Return what was drawn, with the next seed if another trial drew the same: it would be the same run."""
+        again = sum(trial.user_attrs.get("drawn") == drawn for trial in others)
         if not again:
             return drawn
         experiment, _, _ = self._composed(drawn)
         return [*drawn, f"seed={experiment.seed + again * self._config.config.seeds}"]
 
-    def _made(self, index: int, overrides: Sequence[str]) -> Run:
-        """Make the run of one seed, evaluate it, and record both."""
+    def _made(self, overrides: Sequence[str]) -> SeedRun:
+        """Make the run of the present seed, and evaluate it."""
         began = time.monotonic()
-        known = self._runs[index] if index < len(self._runs) else None
         self._pruned_by = None
-        if known is not None and (lost := self._lost_again(known)) is not None:
-            self._record(lost)
+        begun = self._run
+        if begun is not None and (lost := self._lost_again(begun)) is not None:
             return lost
         # By its name: a study never leads to a folder elsewhere.
-        outcome = None if known is None else self._resumed(self._config.folder / Path(known["run_dir"]).name)
+        folder = None if begun is None else self._config.folder / Path(begun.run_dir or "").name
+        outcome = None if folder is None else self._resumed(folder)
         if outcome is None:
-            outcome = self._trained(index, overrides)
+            outcome = self._trained(overrides)
         if outcome.status == INTERRUPTED:
             raise Interrupted
         decision = outcome.summary.get("stopping") or {}
-        run = {
-            **self._runs[index],
-            "status": outcome.status,
-            "reason": outcome.reason,
-            "outcome": self._pruned_by or decision.get("rule", FINISHED),
-            "env_steps": outcome.summary["env_steps"],
-            "wall_clock_s": outcome.summary["wall_clock_s"],
-        }
+        run = replace(
+            self._runs[self._seed],
+            status=outcome.status,
+            reason=outcome.reason,
+            ending=self._pruned_by or decision.get("rule", FINISHED),
+            env_steps=outcome.summary["env_steps"],
+            wall_clock_s=outcome.summary["wall_clock_s"],
+        )
         if outcome.status == FAILED:
             error = outcome.error
             trace = "".join(traceback.format_exception(error)) if error else outcome.reason
             run = _as_failed(run, outcome.reason, trace)
         else:
             try:
-                run |= self._evaluated(outcome.folder)
+                run = replace(run, **self._evaluated(outcome.folder))
             except RunFailed as error:
                 run = _as_failed(run, f"evaluation: {error}", traceback.format_exc())
-        run["took_s"] = round(time.monotonic() - began, 1)
-        self._record(run)
-        return run
+        return replace(run, took_s=round(time.monotonic() - began, 1))
 
-    def _trained(self, index: int, overrides: Sequence[str]) -> TrainResult:
+    def _trained(self, overrides: Sequence[str]) -> TrainResult:
         own = [*overrides, f"name={self._config.study}", f"runs_dir={self._config.runs_dir}"]
         # Where a trial's cars drive is no part of it, and left out of the command that repeats it.
         given = {key_of(override) for override in overrides}
@@ -342,8 +337,8 @@ class TrialRun(Callback):
         if experiment.observation.camera is not None:
             # Several threads update such networks, and the last digits depend on how many.
             self._patiently(lambda: self._trial.set_user_attr("where", where))
-        if index:
-            experiment, composition, start = self._composed([*own, f"seed={experiment.seed + index}"])
+        if self._seed:
+            experiment, composition, start = self._composed([*own, f"seed={experiment.seed + self._seed}"])
         title, tags = self._title_and_tags()
         return run_training(experiment, composition, None, start, [self], run_name=title, tags=tags)
 
@@ -355,8 +350,6 @@ class TrialRun(Callback):
             # Its process is suspended or slow and may wake up: it keeps the folder.
             run_dir = copy_run(run_dir, self._lease.claim.attempt)
             self._begin(run_dir)
-        else:
-            self._patiently(lambda: self._trial.set_user_attr("run_dir", str(run_dir)))
         title, tags = self._title_and_tags()
         try:
             return resume(run_dir, [], None, [self], run_name=title, tags=tags)
@@ -364,23 +357,24 @@ class TrialRun(Callback):
             summary = read_object(run_dir / SUMMARY)
             return TrainResult(summary["status"], summary["reason"], 0, run_dir, summary)
 
-    def _lost_again(self, run: Run) -> Run | None:
-        """Count one more attempt at a run; return it as failed if its process was lost each time so far."""
-        checkpoints = kept_checkpoints(Path(run["run_dir"]) / CHECKPOINTS)
+    def _lost_again(self, run: SeedRun) -> SeedRun | None:
+        """Count another attempt at a run; return it as failed if its process was lost each time so far."""
+        run_dir = Path(run.run_dir or "")
+        checkpoints = kept_checkpoints(run_dir / CHECKPOINTS)
         at = max((int(path.name) for path in checkpoints if path.name.isdecimal()), default=0)
-        lost = run.get("tries", 1) if run.get("tried_at", 0) == at else 0
-        self._record(run | {"tried_at": at, "tries": lost + 1})
+        lost = run.tries if run.tried_at == at else 0
+        self._record(replace(run, tried_at=at, tries=lost + 1))
         if lost < _MOST_TRIES:
             return None
         reason = f"its worker was lost {lost} times after iteration {at}: killed, or ended by what it ran"
-        last = (_rows(Path(run["run_dir"])) or [{}])[-1]
-        spent = {"env_steps": last.get("env_steps", 0), "wall_clock_s": last.get("wall_clock_s", 0.0)}
-        return _as_failed(run | spent, reason, reason)
+        last = (_rows(run_dir) or [{}])[-1]
+        env_steps, wall_clock_s = last.get("env_steps", 0), last.get("wall_clock_s", 0.0)
+        return _as_failed(replace(run, env_steps=env_steps, wall_clock_s=wall_clock_s), reason, reason)
 
     def _composed(self, overrides: list[str]) -> tuple[Experiment, Composition, Start | None]:
-        if not self._config.parent:
+        if self._config.parent is None:
             return *compose_experiment(overrides, stored=True), None
-        clone = prepare_clone([*self._config.parent, *overrides], self._config.runs_dir, None, stored=True)
+        clone = self._config.parent.clone(overrides, self._config.runs_dir, stored=True)
         return clone.experiment, clone.composition, clone.start
 
     def _evaluated(self, folder: Path) -> dict[str, Any]:
@@ -392,7 +386,7 @@ class TrialRun(Callback):
         usual = evaluation.on(USUAL)
         held_out = evaluation.on(HELD_OUT).completion if HELD_OUT in evaluation.conditions else None
         return {
-            "value": values_of(evaluation, self._config.config.objectives, self._config.protocol.time_s),
+            "values": values_of(evaluation, self._config.config.objectives, self._config.protocol.time_s),
             "lap_time_s": usual.mean_lap_time_s,
             "completion": usual.completion,
             "held_out_completion": held_out,
@@ -413,61 +407,44 @@ class TrialRun(Callback):
         found = open_trial_run(store, self._config.study, self._number, study_run_id, overrides)
         return found or study_run_id
 
-    def _track(self, result: TrialResult) -> None:
+    def _track(self, ended: Trial) -> None:
         """Write the trial's result to MLflow, beside what its runs have logged."""
         if self._config.store is None:
             return
-        run_id = self._parent_run_id if self._config.config.seeds > 1 else self._runs[0].get("mlflow_run_id")
+        run_id = self._parent_run_id if self._config.config.seeds > 1 else self._runs[0].mlflow_run_id
         if run_id is None or run_id == self._config.study_run_id:
             return
         values: dict[str, float | None] = {
-            "lap_time": result.attrs["lap_time_s"],
-            "completion": result.attrs["completion"],
-            **dict(zip(self._config.config.objectives, result.values or (), strict=False)),
+            "lap_time": ended.lap_time_s,
+            "completion": ended.completion,
+            **dict(zip(self._config.config.objectives, ended.values or (), strict=False)),
         }
-        status: Status = "FAILED" if result.state == "FAIL" else "FINISHED"
-        end = f"{result.state.lower()}: {result.attrs['reason']}"
+        status: Status = "FAILED" if ended.state == "FAIL" else "FINISHED"
+        end = f"{ended.state.lower()}: {ended.reason}"
         end_trial_run(self._config.store, self._config.study, run_id, status, end, trial_metrics(values))
 
     def _patiently(self, call: Callable[[], Value]) -> Value:
         return patiently(call, self._config.config.patience_s)
 
-    def _record(self, run: Run) -> None:
+    def _record(self, run: SeedRun) -> None:
         """Store the present run for a later owner."""
         self._runs[self._seed :] = [run]
         claim = self._lease.claim
         # With what was drawn: a short trial ends before the first renewal.
         progress = self._lease.progress or None
-        self._lease.held(lambda: self._claims.record(claim, runs=self._runs, progress=progress))
+        self._lease.held(lambda: self._claims.record(claim, self._runs, progress))
 
-    def _with_attrs(self, state: str, values: list[float] | None, overrides: list[str]) -> TrialResult:
-        """Return a result with attributes: sums and means over the runs; the last one gives outcome and reason."""
-        last = self._runs[-1]
+    @property
+    def _run(self) -> SeedRun | None:
+        """The run of the present seed, None before it is begun."""
+        return self._runs[self._seed] if self._seed < len(self._runs) else None
 
-        def mean(key: str) -> float | None:
-            known = [run[key] for run in self._runs if run.get(key) is not None]
-            return sum(known) / len(known) if known else None
-
-        attrs = {
-            "slot": self._lease.claim.index,
-            "number": self._number,
-            "overrides": overrides,
-            "attempt": self._lease.claim.attempt,
-            "runs": self._runs,
-            "run_dir": self._runs[0]["run_dir"],
-            "outcome": last["outcome"],
-            "reason": last["reason"],
-            "env_steps": sum(run["env_steps"] for run in self._runs),
-            "wall_clock_s": sum(run["wall_clock_s"] for run in self._runs),
-            **{key: mean(key) for key in ("lap_time_s", "completion", "held_out_completion")},
-            "mlflow_run_id": self._runs[0].get("mlflow_run_id"),
-            **({"traceback": last["traceback"]} if "traceback" in last else {}),
-        }
-        return TrialResult(state=state, values=values, attrs=attrs)
+    def _as_trial(self, state: str, values: list[float] | None = None) -> Trial:
+        return Trial(number=self._number, state=state, values=values, runs=tuple(self._runs))
 
 
-def _as_failed(run: Run, reason: str, trace: str) -> Run:
-    return {**run, "status": FAILED, "outcome": FAILED, "reason": reason, "traceback": trace}
+def _as_failed(run: SeedRun, reason: str, trace: str) -> SeedRun:
+    return replace(run, status=FAILED, ending=FAILED, reason=reason, traceback=trace)
 
 
 def _rows(run_dir: Path) -> list[dict[str, Any]]:

@@ -14,6 +14,8 @@ from deepracer_exp.config.sweep import SweepConfig
 from deepracer_exp.sweeps.search.space import SearchSpace
 from deepracer_exp.tracking.store import Store
 
+from .parent import Parent
+
 
 @dataclass(frozen=True, kw_only=True)
 class WorkerConfig:
@@ -24,8 +26,8 @@ class WorkerConfig:
     config: SweepConfig
     protocol: EvaluationConfig
     space: SearchSpace
-    parent: tuple[str, ...]
-    """Overrides that name the run and checkpoint that all trials are clones of; empty: trials start from scratch."""
+    parent: Parent | None
+    """What all trials are clones of; None: they start from scratch."""
     store: Store | None
     """Where runs are recorded; None with `tracking=off`."""
     study_run_id: str | None

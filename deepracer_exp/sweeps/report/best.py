@@ -1,9 +1,8 @@
 """The best trial of a study: its values, the command that trains it, its run."""
 
 import shlex
-from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import optuna
 from optuna.trial import FrozenTrial, TrialState
@@ -12,16 +11,32 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.lookup.best import BestOfSweep, write_best_of_sweep
 from deepracer_exp.runs.files import is_run
 from deepracer_exp.sweeps.search.objectives import cost, objectives_of, shown_values
+from deepracer_exp.sweeps.trial import SeedRun, Trial
 
 
-def reranked(study: optuna.Study) -> list[Mapping[str, Any]]:
+@dataclass(frozen=True, kw_only=True)
+class FreshLaps:
+    """What the best checkpoints of a trial, one per seed, drove on fresh laps."""
+
+    trial: int
+    values: list[float]
+    """Values of the objectives, means over the seeds."""
+    interval: list[float]
+    """Both ends of the 95 per cent interval of the first of them."""
+    lap_time_s: float | None
+    completion: float
+    held_out_completion: float | None
+
+
+def reranked(study: optuna.Study) -> list[FreshLaps]:
     """Return the results of the best trials on fresh laps, the best first; empty before that.
 
     Empty again once more trials are complete: those on fresh laps may not be the best any more.
     """
     objectives, count = objectives_of(study), len(complete_trials(study))
-    found = study.user_attrs.get("reranked") if study.user_attrs.get("reranked_of", count) == count else None
-    return sorted(found or (), key=lambda one: cost(objectives, one["values"]))
+    attrs = study.user_attrs
+    stored = attrs.get("reranked", []) if attrs.get("reranked_of", count) == count else []
+    return sorted((FreshLaps(**laps) for laps in stored), key=lambda laps: cost(objectives, laps.values))
 
 
 def complete_trials(study: optuna.Study) -> list[FrozenTrial]:
@@ -40,21 +55,21 @@ def best_trial(study: optuna.Study) -> FrozenTrial:
     complete = complete_trials(study)
     if not complete:
         raise BadInput(f"study {study.study_name}: none of its {len(study.trials)} trials is complete yet")
-    first = next(iter(reranked(study)), {})
-    return next((trial for trial in complete if trial.number == first.get("trial")), complete[0])
+    numbers = [laps.trial for laps in reranked(study)]
+    return next((trial for trial in complete if trial.number in numbers[:1]), complete[0])
 
 
 def best_values(study: optuna.Study) -> list[float]:
     """Return the values of the best trial, on fresh laps if it drove some."""
     trial = best_trial(study)
-    on_fresh_laps = {one["trial"]: one["values"] for one in reranked(study)}
+    on_fresh_laps = {laps.trial: laps.values for laps in reranked(study)}
     return list(on_fresh_laps.get(trial.number, trial.values))
 
 
 def best_shown(study: optuna.Study) -> str:
     """Return the values of the best trial as text, with "on fresh laps" if they are from there."""
     number, values = best_trial(study).number, shown_values(objectives_of(study), best_values(study))
-    return values + " on fresh laps" * any(one["trial"] == number for one in reranked(study))
+    return values + " on fresh laps" * any(laps.trial == number for laps in reranked(study))
 
 
 def best_line(study: optuna.Study) -> str:
@@ -62,8 +77,8 @@ def best_line(study: optuna.Study) -> str:
     attrs = best_trial(study).user_attrs
     overrides = [str(override) for key in ("overrides", "where") for override in attrs.get(key, ())]
     if parent := study.user_attrs.get("parent_run"):
-        run, *checkpoint = parent
-        return shlex.join(["deepracer-exp", "clone", run.removeprefix("run="), *checkpoint, *overrides])
+        clone = ["deepracer-exp", "clone", parent["run_dir"], f"checkpoint={parent['checkpoint']}"]
+        return shlex.join([*clone, *overrides])
     return shlex.join(["deepracer-exp", "train", *overrides])
 
 
@@ -74,18 +89,16 @@ def best_run(study: optuna.Study, runs_dir: Path | None = None) -> Path:
         BadInput: no trial is complete, or the folder is neither where it was nor in `runs_dir`.
     """
     trial, objectives = best_trial(study), objectives_of(study)
-    runs = [run for run in trial.user_attrs.get("runs", ()) if run.get("value") is not None]
-    best = min(runs, key=lambda run: cost(objectives, run["value"]), default=trial.user_attrs)
-    stored = Path(best.get("run_dir") or "")
+    runs = [run for run in Trial.of(trial).runs if run.values]
+    best = min(runs, key=lambda run: cost(objectives, run.values or ()), default=SeedRun(seed=0))
     base = runs_dir or Path(study.user_attrs.get("runs_dir", "runs"))
-    candidates = [base / study.study_name / stored.name, stored]
-    found = next((folder for folder in candidates if is_run(folder)), None)
-    if not stored.name or found is None:
+    folder = best.folder(base / study.study_name)
+    if best.run_dir is None or not is_run(folder):
         raise BadInput(
-            f"study {study.study_name}: {stored} of trial {trial.number} is gone; "
+            f"study {study.study_name}: {folder} of trial {trial.number} is gone; "
             "give runs_dir= if the runs have moved"
         )
-    return found
+    return folder
 
 
 def write_best(study: optuna.Study, runs_dir: Path) -> Path:

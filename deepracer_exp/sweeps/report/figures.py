@@ -1,6 +1,6 @@
 """Figures of a study: Optuna's own plots in the style of the analysis pages, and two that Optuna does not draw.
 
-Ours are the entropy of all trials by outcome, and parallel coordinates: Optuna draws those without axes to drag along
+Ours are the entropy of all trials by ending, and parallel coordinates: Optuna draws those without axes to drag along
 and with one trace per trial, which is slow for hundreds.
 """
 
@@ -29,9 +29,10 @@ from deepracer_exp.analysis.charts.style import CATEGORIES, GRID, NARROW_WIDTH, 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.files import METRICS, read_metrics
 from deepracer_exp.sweeps.search.objectives import MEASURES, NONE, objectives_of
+from deepracer_exp.sweeps.trial import Trial
 
 from .best import best_trial
-from .labels import OUTCOMES, outcome_of, outcome_words, parameter, short_keys
+from .labels import ENDINGS, ending_of, ending_words, parameter, short_keys
 
 FEWEST_COMPLETE = 20
 """Complete trials below which importance is chance: the best quarter would be fewer than five trials."""
@@ -354,7 +355,7 @@ def _parameter_axis(key: str, label: str, trials: Sequence[FrozenTrial]) -> dict
 
 
 def _entropy_curves(study: optuna.Study, trials: Sequence[FrozenTrial]) -> go.Figure | None:
-    """Draw the entropy of every trial's policy during training, coloured by the trial's outcome."""
+    """Draw the entropy of every trial's policy during training, coloured by the trial's ending."""
     rows = {trial.number: runs for trial in trials if (runs := _rows(study, trial))}
     if not rows:
         return None
@@ -362,20 +363,21 @@ def _entropy_curves(study: optuna.Study, trials: Sequence[FrozenTrial]) -> go.Fi
     column = "entropy_share" if any(row.get("entropy_share") is not None for row in every) else "entropy"
     known = [trial for trial in trials if trial.number in rows]
     figure = go.Figure()
-    for outcome, style in OUTCOMES.items():
-        if some := [rows[trial.number] for trial in known if outcome_of(trial) == outcome]:
-            numbers = [trial.number for trial in known if outcome_of(trial) == outcome]
+    for ending, style in ENDINGS.items():
+        numbers = [trial.number for trial in known if ending_of(trial) == ending]
+        if numbers:
+            some = {number: rows[number] for number in numbers}
             line = {"color": style.color, "dash": style.dash, "width": 1.3}
             most = max(_FEWEST_POINTS, _MOST_POINTS // sum(map(len, rows.values())))
-            curves = _curves(dict(zip(numbers, some, strict=True)), column, most)
-            figure.add_trace(curves.update(name=outcome_words(outcome), line=line, opacity=0.75))
+            curves = _curves(some, column, most)
+            figure.add_trace(curves.update(name=ending_words(ending), line=line, opacity=0.75))
     if any(trial.state == TrialState.COMPLETE for trial in trials):
         best = best_trial(study)
         if best.number in rows:
-            line = {"color": OUTCOMES[outcome_of(best)].color, "width": 4.5}
+            line = {"color": ENDINGS[ending_of(best)].color, "width": 4.5}
             curves = _curves({best.number: rows[best.number]}, column, _MOST_POINTS)
             figure.add_trace(curves.update(name=f"best: trial {best.number}", line=line))
-    _styled(figure, "Entropy of the policies, by outcome of their trials", 460)
+    _styled(figure, "Entropy of the policies, by ending of their trials", 460)
     figure.update_xaxes(title_text="control steps", rangemode="tozero")
     if column == "entropy_share":
         return figure.update_yaxes(title_text="entropy, share of a random policy's", tickformat=".0%")
@@ -400,14 +402,11 @@ def _curves(rows: Mapping[int, list[list[dict[str, Any]]]], column: str, most: i
 
 def _rows(study: optuna.Study, trial: FrozenTrial) -> list[list[dict[str, Any]]]:
     """Return the rows of a trial's runs, without runs whose files are gone or incomplete."""
-    stored = [run.get("run_dir") for run in trial.user_attrs.get("runs") or ()]
     base = Path(study.user_attrs.get("runs_dir", "runs")) / study.study_name
     found = []
-    for folder in dict.fromkeys(Path(name) for name in stored or [trial.user_attrs.get("run_dir")] if name):
-        candidates = (base / folder.name / METRICS, folder / METRICS)
-        file = next((one for one in candidates if one.is_file()), None)
+    for run in Trial.of(trial).runs:
         try:
-            rows = [] if file is None else read_metrics(file)
+            rows = read_metrics(run.folder(base) / METRICS)
         except BadInput:
             continue
         if rows := [row for row in rows if isinstance(row.get("env_steps"), int)]:

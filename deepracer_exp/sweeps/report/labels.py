@@ -5,9 +5,11 @@ from typing import Any, NamedTuple
 
 from optuna.trial import FrozenTrial, TrialState
 
+from deepracer_exp.sweeps.trial import Trial
 
-class OutcomeStyle(NamedTuple):
-    """How trials with one outcome are drawn."""
+
+class EndingStyle(NamedTuple):
+    """How trials with the same ending are drawn."""
 
     color: str
     dash: str
@@ -15,39 +17,39 @@ class OutcomeStyle(NamedTuple):
     meaning: str
 
 
-OUTCOMES: Mapping[str, OutcomeStyle] = {
-    "finished": OutcomeStyle("#0072B2", "longdash", "used its whole budget"),
-    "converged": OutcomeStyle("#009E73", "solid", "learned to drive and stopped improving"),
-    "reliable": OutcomeStyle("#56B4E9", "dashdot", "completed enough laps"),
-    "plateau": OutcomeStyle("#A0C0E0", "dot", "stopped improving"),
-    "overfitting": OutcomeStyle("#E0C0A0", "dash", "lost held-out conditions while its return held"),
-    "collapsed": OutcomeStyle("#D55E00", "dash", "entropy fell before it could drive"),
-    "not_learning": OutcomeStyle("#E69F00", "dot", "entropy and completion stayed where they began"),
-    "median": OutcomeStyle("#CC79A7", "dash", "worse than the median of the others at the same point"),
-    "percentile": OutcomeStyle("#882255", "dot", "not among the best share of the others at the same point"),
-    "hyperband": OutcomeStyle("#A060E0", "dashdot", "lost its bracket"),
-    "wilcoxon": OutcomeStyle("#332288", "longdash", "lost to the best trial, seed by seed"),
-    "pruned": OutcomeStyle("#A04080", "solid", "worse than the others"),
-    "failed": OutcomeStyle("#000000", "longdashdot", "ended by an error"),
-    "running": OutcomeStyle("#9A9A9A", "dot", "still running"),
+ENDINGS: Mapping[str, EndingStyle] = {
+    "finished": EndingStyle("#0072B2", "longdash", "used its whole budget"),
+    "converged": EndingStyle("#009E73", "solid", "learned to drive and stopped improving"),
+    "reliable": EndingStyle("#56B4E9", "dashdot", "completed enough laps"),
+    "plateau": EndingStyle("#A0C0E0", "dot", "stopped improving"),
+    "overfitting": EndingStyle("#E0C0A0", "dash", "lost held-out conditions while its return held"),
+    "collapsed": EndingStyle("#D55E00", "dash", "entropy fell before it could drive"),
+    "not_learning": EndingStyle("#E69F00", "dot", "entropy and completion stayed where they began"),
+    "median": EndingStyle("#CC79A7", "dash", "worse than the median of the others at the same point"),
+    "percentile": EndingStyle("#882255", "dot", "not among the best share of the others at the same point"),
+    "hyperband": EndingStyle("#A060E0", "dashdot", "lost its bracket"),
+    "wilcoxon": EndingStyle("#332288", "longdash", "lost to the best trial, seed by seed"),
+    "pruned": EndingStyle("#A04080", "solid", "worse than the others"),
+    "failed": EndingStyle("#000000", "longdashdot", "ended by an error"),
+    "running": EndingStyle("#9A9A9A", "dot", "still running"),
 }
-"""By the trial's attribute `outcome`. Colours after Okabe and Ito (jfly.uni-koeln.de/color); the others differ from
+"""By `Trial.ending`. Colours after Okabe and Ito (jfly.uni-koeln.de/color); the others differ from
 them for colour-blind readers, too, or are drawn with another dash."""
 
 _BY_STATE = {TrialState.COMPLETE: "finished", TrialState.PRUNED: "pruned", TrialState.FAIL: "failed"}
 
 
-def outcome_of(trial: FrozenTrial) -> str:
-    """Return how a trial ended, a key of OUTCOMES."""
+def ending_of(trial: FrozenTrial) -> str:
+    """Return how a trial ended, a key of ENDINGS."""
     if not trial.state.is_finished():
         return "running"
-    stored = trial.user_attrs.get("outcome", "")
-    return stored if stored in OUTCOMES else _BY_STATE[trial.state]
+    stored = Trial.of(trial).ending
+    return stored if stored in ENDINGS else _BY_STATE[trial.state]
 
 
-def outcome_words(outcome: str) -> str:
-    """Return an outcome as people write it: ``not learning``."""
-    return outcome.replace("_", " ")
+def ending_words(ending: str) -> str:
+    """Return an ending as people write it: ``not learning``."""
+    return ending.replace("_", " ")
 
 
 def short_keys(keys: Iterable[str]) -> dict[str, str]:

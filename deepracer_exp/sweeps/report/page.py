@@ -10,7 +10,7 @@ import optuna
 from optuna.trial import FrozenTrial, TrialState
 
 from deepracer_exp.analysis.next_steps import COMMAND, command_line
-from deepracer_exp.analysis.next_steps import outcome as outcome_of_run
+from deepracer_exp.analysis.next_steps import outcome as run_outcome
 from deepracer_exp.analysis.page import plot, render
 from deepracer_exp.config.own_class import OF_POLICY
 from deepracer_exp.errors import BadInput, count
@@ -24,10 +24,11 @@ from deepracer_exp.sweeps.search.objectives import (
     shown_or_dash,
     shown_values,
 )
+from deepracer_exp.sweeps.trial import Trial
 
 from .best import best_line, best_run, best_shown, best_trial, complete_trials, reranked
 from .figures import FEWEST_COMPLETE, figures, least_width, narrowed
-from .labels import OUTCOMES, duration, outcome_of, outcome_words, parameter, short_keys, steps
+from .labels import ENDINGS, duration, ending_of, ending_words, parameter, short_keys, steps
 from .seeds import over_seeds
 
 _MOST_ROWS = 300
@@ -63,7 +64,7 @@ def study_page(study: optuna.Study) -> str:
         plots,
         study=study.study_name,
         headline=study_summary(study),
-        outcomes=outcomes(trials),
+        endings=endings(trials),
         winner=_winner(study, keys) if complete else [],
         steps=_next_steps(study) if complete else [(_resume(study), "continue the search")],
         picture=_picture(study) if complete else None,
@@ -90,7 +91,7 @@ def study_summary(study: optuna.Study) -> list[str]:
     if complete:
         best = best_trial(study)
         sentences.append(f"Trial {best.number} is the best: {best_shown(study)}.")
-        if best.user_attrs.get("lap_time_s") is None:
+        if Trial.of(best).lap_time_s is None:
             sentences.append("It completed no lap.")
         if len(study.directions) > 1:
             sentences.append(f"{len(study.best_trials)} trials are on the Pareto front.")
@@ -108,12 +109,12 @@ def study_summary(study: optuna.Study) -> list[str]:
 def _winner(study: optuna.Study, keys: dict[str, str]) -> list[tuple[str, str]]:
     """Return the winner's parameters and results, as names and values."""
     best = best_trial(study)
-    attrs = best.user_attrs
+    results = Trial.of(best)
     found = [
         *((keys[key], parameter(value)) for key, value in best.params.items()),
-        ("Mean usual lap", shown_or_dash("lap_time", attrs.get("lap_time_s"))),
-        ("Usual completion", shown_or_dash("completion", attrs.get("completion"))),
-        ("How its training ended", str(attrs.get("reason") or outcome_words(outcome_of(best)))),
+        ("Mean usual lap", shown_or_dash("lap_time", results.lap_time_s)),
+        ("Usual completion", shown_or_dash("completion", results.completion)),
+        ("How its training ended", results.reason or ending_words(ending_of(best))),
     ]
     try:
         run = read_head(best_run(study))
@@ -121,9 +122,7 @@ def _winner(study: optuna.Study, keys: dict[str, str]) -> list[tuple[str, str]]:
         return found
     known = {name.lower() for name, _ in found}
     return [
-        pair
-        for pair in outcome_of_run(run)
-        if pair[0] in ("Track", "Reward") and pair[0].lower() not in known
+        pair for pair in run_outcome(run) if pair[0] in ("Track", "Reward") and pair[0].lower() not in known
     ] + found
 
 
@@ -157,14 +156,14 @@ def _picture(study: optuna.Study) -> str | None:
     return base64.b64encode(picture).decode("ascii")
 
 
-def outcomes(trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
-    """Return for each outcome its trials and control steps, with their shares in per cent."""
+def endings(trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
+    """Return for each ending its trials and control steps, with their shares in per cent."""
     spent, found = _spent(trials), []
-    for outcome, style in OUTCOMES.items():
-        if some := [trial for trial in trials if outcome_of(trial) == outcome]:
+    for ending, style in ENDINGS.items():
+        if some := [trial for trial in trials if ending_of(trial) == ending]:
             found.append(
                 {
-                    "outcome": outcome_words(outcome),
+                    "ending": ending_words(ending),
                     "color": style.color,
                     "meaning": style.meaning,
                     "count": len(some),
@@ -177,25 +176,25 @@ def outcomes(trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
 
 
 def _spent(trials: Sequence[FrozenTrial]) -> int:
-    return sum(trial.user_attrs.get("env_steps") or 0 for trial in trials)
+    return sum(Trial.of(trial).env_steps for trial in trials)
 
 
 def _winners(study: optuna.Study, objectives: Sequence[str], keys: dict[str, str]) -> list[dict[str, Any]]:
     """Return the re-ranked trials, the best on fresh laps first."""
     by_number = {trial.number: trial for trial in complete_trials(study)}
     found = []
-    for one in reranked(study):
-        trial, interval = by_number[one["trial"]], one.get("interval")
+    for laps in reranked(study):
+        trial = by_number[laps.trial]
         params = ", ".join(f"{keys[key]} {parameter(value)}" for key, value in trial.params.items())
         found.append(
             {
                 "trial": trial.number,
-                "now": shown_values(objectives, one["values"]),
+                "now": shown_values(objectives, laps.values),
                 "before": shown_values(objectives, trial.values),
-                "interval": " to ".join(shown(objectives[0], end) for end in interval) if interval else NONE,
-                "lap_time": shown_or_dash("lap_time", one.get("lap_time_s")),
-                "completion": shown_or_dash("completion", one.get("completion")),
-                "held_out": shown_or_dash("completion", one.get("held_out_completion")),
+                "interval": " to ".join(shown(objectives[0], end) for end in laps.interval),
+                "lap_time": shown_or_dash("lap_time", laps.lap_time_s),
+                "completion": shown_or_dash("completion", laps.completion),
+                "held_out": shown_or_dash("completion", laps.held_out_completion),
                 "parameters": params,
             }
         )
@@ -215,20 +214,20 @@ def _table(study: optuna.Study, objectives: Sequence[str], keys: dict[str, str])
     ]
     rows = []
     for trial in order[:_MOST_ROWS]:
-        attrs, outcome = trial.user_attrs, outcome_of(trial)
+        results, ending = Trial.of(trial), ending_of(trial)
         values = [shown_or_dash(name, _value(trial, at)) for at, name in enumerate(objectives)]
-        values += [shown_or_dash(objective, attrs.get(attr)) for attr, objective in extra]
-        values.append(shown_or_dash("completion", attrs.get("held_out_completion")))
-        reason, clock_s = str(attrs.get("reason") or ""), attrs.get("wall_clock_s")
+        values += [shown_or_dash(objective, getattr(results, attr)) for attr, objective in extra]
+        values.append(shown_or_dash("completion", results.held_out_completion))
+        reason = results.reason
         rows.append(
             {
                 "number": trial.number,
-                "outcome": outcome_words(outcome),
-                "color": OUTCOMES[outcome].color,
+                "ending": ending_words(ending),
+                "color": ENDINGS[ending].color,
                 "complete": trial.state == TrialState.COMPLETE,
                 "values": values,
-                "steps": steps(attrs["env_steps"]) if attrs.get("env_steps") else NONE,
-                "time": NONE if clock_s is None else duration(clock_s),
+                "steps": steps(results.env_steps) if results.env_steps else NONE,
+                "time": duration(results.wall_clock_s) if trial.state.is_finished() else NONE,
                 "parameters": [parameter(trial.params.get(key, NONE)) for key in columns],
                 "reason": reason if len(reason) <= _LONGEST_REASON else f"{reason[: _LONGEST_REASON - 1]}…",
             }
@@ -256,13 +255,13 @@ def _failures(trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
     groups: dict[str, list[FrozenTrial]] = {}
     for trial in trials:
         if trial.state == TrialState.FAIL:
-            groups.setdefault(str(trial.user_attrs.get("reason") or "no reason stored"), []).append(trial)
+            groups.setdefault(Trial.of(trial).reason or "no reason stored", []).append(trial)
     found: list[dict[str, Any]] = [
         {
             "reason": reason,
             "numbers": ", ".join(str(trial.number) for trial in some[:12]) + ", …" * (len(some) > 12),
             "count": len(some),
-            "traceback": str(some[0].user_attrs.get("traceback") or "")[-_LONGEST_TRACEBACK:],
+            "traceback": Trial.of(some[0]).traceback[-_LONGEST_TRACEBACK:],
         }
         for reason, some in groups.items()
     ]

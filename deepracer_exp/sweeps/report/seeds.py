@@ -9,6 +9,7 @@ from optuna.trial import FrozenTrial
 from deepracer_exp.analysis.evidence import Interval, difference, estimate
 from deepracer_exp.analysis.statistics import Values
 from deepracer_exp.sweeps.search.objectives import MEASURES, NONE, objectives_of, shown
+from deepracer_exp.sweeps.trial import Trial
 
 from .best import best_trial, complete_trials
 from .labels import parameter
@@ -53,8 +54,7 @@ def over_seeds(study: optuna.Study, keys: dict[str, str]) -> list[dict[str, Any]
 
 
 def _values(trial: FrozenTrial) -> Values:
-    runs = trial.user_attrs.get("runs") or ()
-    return np.array([run["value"][0] for run in runs if run.get("value") is not None], np.float64)
+    return np.array([run.values[0] for run in Trial.of(trial).runs if run.values], np.float64)
 
 
 def _ends(objective: str, interval: Interval | None) -> str:

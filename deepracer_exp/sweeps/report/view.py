@@ -13,12 +13,13 @@ from rich.table import Table
 from rich.text import Text
 
 from deepracer_exp.errors import count
-from deepracer_exp.sweeps.queue.claims import Claim, TrialResult
+from deepracer_exp.sweeps.queue.claims import Claim
 from deepracer_exp.sweeps.queue.worker_config import WorkerConfig
 from deepracer_exp.sweeps.search.objectives import NONE, cost, shown_values
+from deepracer_exp.sweeps.trial import Trial
 from deepracer_exp.training.display import sparkline
 
-from .labels import duration, outcome_words, parameter, short_keys
+from .labels import duration, ending_words, parameter, short_keys
 
 _POINTS = 16
 """Characters of a sparkline."""
@@ -58,13 +59,13 @@ class SweepView:
 
     def show(self, claims: Sequence[Claim], stage: str = "") -> None:
         """Draw the present state of all claims; `stage` says what happens while no trial runs."""
-        ended = {one.index for one in claims if one.result is not None}
+        ended = {one.trial.number for one in claims if one.has_ended}
         if self._made_before is None:
             self._made_before, self._printed = _made(claims), set(ended)
         for one in claims:
             self._follow(one)
-            if self._live is None and one.result is not None and one.index not in self._printed:
-                line = _sentence(one, one.result, self._sweep.objectives)
+            if self._live is None and one.trial.number in ended - self._printed:
+                line = _sentence(one, self._sweep.objectives)
                 self._line(f"{line}; {len(ended)} of {self._sweep.trials}, {self._left(claims)}")
         self._printed |= ended
         if self._live is not None:
@@ -77,13 +78,13 @@ class SweepView:
         completion = claim.progress.get("completion")
         if completion is None:
             return
-        seen = self._completions.setdefault(claim.index, collections.deque(maxlen=_POINTS))
+        seen = self._completions.setdefault(claim.trial.number, collections.deque(maxlen=_POINTS))
         if not seen or seen[-1] != completion:
             seen.append(float(completion))
 
     def _panel(self, claims: Sequence[Claim], stage: str) -> Panel:
         parts: list[Any] = [self._summary(claims)]
-        running = [one for one in claims if one.result is None]
+        running = [one for one in claims if not one.has_ended]
         if running:
             parts += [Text(), self._running(running)]
         if stage or not claims:
@@ -92,7 +93,7 @@ class SweepView:
 
     def _summary(self, claims: Sequence[Claim]) -> Table:
         total = self._sweep.trials
-        counts = collections.Counter(one.result.state for one in claims if one.result is not None)
+        counts = collections.Counter(one.trial.state for one in claims if one.has_ended)
         words = ", ".join(f"{counts[one]} {word}" for one, word in _STATES.items())
         grid = Table.grid("", "", padding=(0, 2))
         grid.add_row("trials", ProgressBar(total, min(counts.total(), total), width=40))
@@ -121,25 +122,26 @@ class SweepView:
 
     def _cells(self, claim: Claim) -> tuple[str, ...]:
         row: Mapping[str, Any] = claim.progress
-        name = f"{_number(claim)}" + (f" (attempt {claim.attempt})" if claim.attempt > 1 else "")
+        number = claim.trial.number
+        name = f"{number}" + (f" (attempt {claim.attempt})" if claim.attempt > 1 else "")
         if claim.expired or "env_steps" not in row:
             return name, NONE, NONE, "", NONE, "waits for a worker" if claim.expired else "starts"
         lap_s, evaluated = row.get("eval_lap_time_s"), row.get("eval_completion")
         if evaluated is not None:
             lap = "no lap" if lap_s is None else f"{lap_s:.2f} s"
-            self._evaluated[claim.index] = f"{lap}, {evaluated:.0f}%"
+            self._evaluated[number] = f"{lap}, {evaluated:.0f}%"
         return (
             name,
             f"{row['env_steps']:,}",
             NONE if row["completion"] is None else f"{row['completion']:.0f}%",
-            sparkline(list(self._completions.get(claim.index, ())), _POINTS),
+            sparkline(list(self._completions.get(number, ())), _POINTS),
             f"{row['entropy']:.2f}",
-            self._evaluated.get(claim.index, NONE),
+            self._evaluated.get(number, NONE),
         )
 
 
 def _made(claims: Sequence[Claim]) -> float:
-    return sum(1.0 if one.result is not None else one.progress.get("share", 0.0) for one in claims)
+    return sum(1.0 if one.has_ended else one.progress.get("share", 0.0) for one in claims)
 
 
 def _params(claim: Claim) -> str:
@@ -148,32 +150,20 @@ def _params(claim: Claim) -> str:
     return ", ".join(f"{short} {parameter(params[key])}" for key, short in short_keys(params).items())
 
 
-def _number(claim: Claim) -> object:
-    """Return Optuna's number of the trial, which is known from its first row on."""
-    stored = claim.progress if claim.result is None else claim.progress | claim.result.attrs
-    return stored.get("number", NONE)
-
-
 def _best(claims: Sequence[Claim], objectives: Sequence[str]) -> str:
-    done = {
-        (cost(objectives, one.result.values), one.index): (one, one.result)
-        for one in claims
-        if one.result is not None and one.result.values
-    }
-    if not done:
-        return NONE
-    best, result = done[min(done)]
-    return f"trial {_number(best)}, {_values(result, objectives)}"
+    done = [claim.trial for claim in claims if claim.trial.values]
+    best = min(done, key=lambda trial: (cost(objectives, trial.values or ()), trial.number), default=None)
+    return NONE if best is None else f"trial {best.number}, {_values(best, objectives)}"
 
 
-def _values(result: TrialResult, objectives: Sequence[str]) -> str:
-    lap_s, completion = result.attrs.get("lap_time_s"), result.attrs.get("completion")
-    lap = "no lap" if lap_s is None else f"mean usual lap {lap_s:.2f} s"
-    return f"{shown_values(objectives, result.values or ())} ({lap}, {completion:.0f}% driven)"
+def _values(trial: Trial, objectives: Sequence[str]) -> str:
+    lap = "no lap" if trial.lap_time_s is None else f"mean usual lap {trial.lap_time_s:.2f} s"
+    return f"{shown_values(objectives, trial.values or ())} ({lap}, {trial.completion:.0f}% driven)"
 
 
-def _sentence(claim: Claim, result: TrialResult, objectives: Sequence[str]) -> str:
-    outcome, steps = outcome_words(result.attrs["outcome"]), result.attrs.get("env_steps", 0)
-    end = _values(result, objectives) if result.values else result.attrs.get("reason", "")
+def _sentence(claim: Claim, objectives: Sequence[str]) -> str:
+    trial = claim.trial
+    end = _values(trial, objectives) if trial.values else trial.reason
     values = f" with {params}" if (params := _params(claim)) else ""
-    return f"trial {_number(claim)}{values} {_STATES[result.state]} ({outcome}) after {steps:,} steps: {end}"
+    state, ending = _STATES[trial.state], ending_words(trial.ending)
+    return f"trial {trial.number}{values} {state} ({ending}) after {trial.env_steps:,} steps: {end}"

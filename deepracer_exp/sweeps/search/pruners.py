@@ -21,6 +21,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from deepracer_exp.config.sweep import SweepConfig
 from deepracer_exp.errors import BadInput
+from deepracer_exp.sweeps.trial import Trial
 
 _LEVEL = 0.1
 """Significance level of Wilcoxon's test: how often a trial as good as the best one may be pruned."""
@@ -30,7 +31,7 @@ class PruneDecision(NamedTuple):
     """Why a trial is pruned."""
 
     name: str
-    """`median`, `percentile` or `hyperband`; the trial's outcome."""
+    """`median`, `percentile` or `hyperband`; the trial's ending."""
     reason: str
     """One line."""
 
@@ -102,15 +103,14 @@ def is_worse_across_seeds(study: Study, values: Sequence[float]) -> bool:
 
     The significance level is 0.1; with fewer than five seeds it is the least the test can reach before the last
     seed, 2^-(seeds - 1); after one seed no test can decide. With several objectives there is no best trial: False.
-    `values` are those of a trial's first seeds, in the order of the seeds; the study's complete trials have `runs`
-    in their user attributes.
+    `values` are those of a trial's first seeds, in the order of the seeds.
     """
     complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     if not complete or len(study.directions) > 1 or len(values) < 2:
         return False
     from scipy.stats import wilcoxon  # takes a second, and few sweeps use it
 
-    best = [run["value"][0] for run in study.best_trial.user_attrs["runs"]]
+    best = [run.values[0] for run in Trial.of(study.best_trial).runs if run.values]
     # Its mean over more seeds would say nothing about these.
     behind = np.subtract(values, best[: len(values)])
     if study.direction == StudyDirection.MAXIMIZE:

@@ -40,26 +40,26 @@ def build_sampler(config: SweepConfig, space: SearchSpace) -> BaseSampler:
     if config.sampler == "grid":
         _check_grid(config, space)
 
-    def make(index: int) -> BaseSampler:
-        seed = int(np.random.SeedSequence([config.seed, index]).generate_state(1)[0])
+    def make(number: int) -> BaseSampler:
+        seed = int(np.random.SeedSequence([config.seed, number]).generate_state(1)[0])
         with warnings.catch_warnings():
             # Experimental in Optuna, whose version is pinned: group, with_margin, QMCSampler, BLXAlphaCrossover.
             warnings.simplefilter("ignore", ExperimentalWarning)
-            return _SAMPLERS[config.sampler](config, space, index, seed)
+            return _SAMPLERS[config.sampler](config, space, number, seed)
 
     return _PerTrialSampler(make)
 
 
 class _PerTrialSampler(BaseSampler):
-    """A fresh sampler for each trial, seeded by the trial's index.
+    """A fresh sampler for each trial, seeded by the trial's number.
 
     A sampler draws from its seed on. Workers share the study's seed, so each of them, and each start of a study, would
-    try the same first points again. Here the draws of a trial depend on its index and not on the worker or the moment;
+    try the same first points again. Here the draws of a trial depend on its number and not on the worker or the moment;
     what was learned from earlier trials is in the study.
     """
 
     def __init__(self, make: Callable[[int], BaseSampler]):
-        """Start without any sampler; `make` returns the sampler of a trial by the trial's index."""
+        """Start without any sampler; `make` returns the sampler of a trial by the trial's number."""
         self._make = make
         self._open: dict[int, BaseSampler] = {}
 
@@ -87,26 +87,26 @@ class _PerTrialSampler(BaseSampler):
 
     def _of(self, trial: FrozenTrial) -> BaseSampler:
         if trial.number not in self._open:
-            self._open[trial.number] = self._make(trial.user_attrs.get("slot", trial.number))
+            self._open[trial.number] = self._make(trial.number)
         return self._open[trial.number]
 
 
 class _WholeSpaceQMC(QMCSampler):
-    """Point n of one sequence over the whole space for the trial with index n, whichever worker asks.
+    """Point n of one sequence over the whole space for the trial with number n, whichever worker asks.
 
     Optuna's own counts the points in the study, where two workers may read the same count, and takes the space from
     the first trial, so that keys of other options would be drawn at random.
     """
 
-    def __init__(self, space: dict[str, BaseDistribution], index: int, seed: int):
+    def __init__(self, space: dict[str, BaseDistribution], number: int, seed: int):
         super().__init__(scramble=True, seed=seed)
-        self._space, self._index = space, index
+        self._space, self._number = space, number
 
     def infer_relative_search_space(self, study: Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
         return self._space
 
     def _find_sample_id(self, study: Study, search_space: dict[str, BaseDistribution]) -> int:
-        return self._index
+        return self._number
 
 
 class _EndlessGrid(GridSampler):
@@ -156,30 +156,30 @@ def _as_complete(trial: FrozenTrial) -> FrozenTrial:
 
 _SAMPLERS: dict[str, Callable[[SweepConfig, SearchSpace, int, int], BaseSampler]] = {
     # group: keys that only some trials have get a model of their own.
-    "tpe": lambda config, space, index, seed: TPESampler(
+    "tpe": lambda config, space, number, seed: TPESampler(
         n_startup_trials=config.startup_trials, seed=seed, multivariate=True, group=True, constant_liar=True
     ),
     # Keys that only some trials have are drawn at random; Optuna would warn of it at each trial.
-    "gp": lambda config, space, index, seed: _LearnsFromPruned(
+    "gp": lambda config, space, number, seed: _LearnsFromPruned(
         n_startup_trials=config.startup_trials, seed=seed, warn_independent_sampling=False
     ),
-    "cmaes": lambda config, space, index, seed: CmaEsSampler(
+    "cmaes": lambda config, space, number, seed: CmaEsSampler(
         n_startup_trials=config.startup_trials, seed=seed, with_margin=True, warn_independent_sampling=False
     ),
-    "qmc": lambda config, space, index, seed: _WholeSpaceQMC(_distributions(space), index, config.seed),
+    "qmc": lambda config, space, number, seed: _WholeSpaceQMC(_distributions(space), number, config.seed),
     # The first generation, drawn at random, is the startup of the others. Children are blends of both parents: a copy
     # of one would be the same training again.
-    "nsga2": lambda config, space, index, seed: NSGAIISampler(
+    "nsga2": lambda config, space, number, seed: NSGAIISampler(
         population_size=max(config.startup_trials, 2),
         seed=seed,
         crossover=BLXAlphaCrossover(),
         crossover_prob=1.0,
     ),
     # The sweep's seed gives the order of all points.
-    "grid": lambda config, space, index, seed: _EndlessGrid(dict(space.grid()), seed=config.seed),
-    "random": lambda config, space, index, seed: RandomSampler(seed=seed),
+    "grid": lambda config, space, number, seed: _EndlessGrid(dict(space.grid()), seed=config.seed),
+    "random": lambda config, space, number, seed: RandomSampler(seed=seed),
 }
-"""By name, from (sweep, space, index of the trial, seed of the trial)."""
+"""By name, from (sweep, space, number of the trial, seed of the trial)."""
 
 
 def _distributions(space: SearchSpace) -> dict[str, BaseDistribution]:
