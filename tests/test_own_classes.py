@@ -13,11 +13,11 @@ import torch
 import yaml
 
 from deepracer_exp import load_policy
-from deepracer_exp.analysis.next_steps import command_line, next_steps
 from deepracer_exp.config import acting, own_class
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.options import options
 from deepracer_exp.config.own_class import build_own
+from deepracer_exp.lookup.next_steps import command_line, next_steps
 
 from .conftest import IN_PROCESS, call_in
 

@@ -1,7 +1,7 @@
 """A recording on one course, prepared for figures and findings."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -275,3 +275,13 @@ def _episodes(
     rows = add_derived(rows.reset_index(drop=True), course, discount)
     rows, timed = timed_by_service(rows, recording.metrics)
     return rows, episode_table(rows), timed
+
+
+def prepare_races(recording: Recording, track: str | None = None) -> LogView:
+    """Prepare the evaluations and races of a log, or if there are none its training.
+
+    Raises:
+        BadInput: as for `prepare`.
+    """
+    raced = (recording.steps["stream"] != TRAINING).to_numpy()
+    return prepare(replace(recording, steps=recording.steps[raced]) if raced.any() else recording, track)

@@ -14,8 +14,7 @@ from deepracer_exp.config.car import CarConfig
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.fastest.lap import FastestLap
 
-from .against_log import prepare_races
-from .log_view import prepare
+from .log_view import prepare, prepare_races
 from .statistics import Values
 
 FAST = 0.05

@@ -200,8 +200,8 @@ def _of_run(what: str, stores: Stores, track: str | None) -> _Source:
     chosen = stores.values.get("checkpoint")
     run = check_policy(what, str(stores.runs_dir), stores.uri, chosen)
 
-    from deepracer_exp.evaluation.driven_laps import commands_of_run
     from deepracer_exp.export.aws_files import services_metadata
+    from deepracer_exp.reports.driven_laps import commands_of_run
 
     with warnings_on_stderr():
         commands = commands_of_run(run, chosen)

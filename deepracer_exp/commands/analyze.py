@@ -13,8 +13,8 @@ from .replay import add_replay, check_replay, write_laps
 
 if TYPE_CHECKING:
     from deepracer_exp.analysis.log_view import LogView
-    from deepracer_exp.analysis.page import Glimpse
     from deepracer_exp.config.car import CarConfig
+    from deepracer_exp.reports.page import Glimpse
 
 _EPILOG = """\
   deepracer-exp analyze RUN                                 one of our runs
@@ -89,12 +89,12 @@ def _analyze(args: argparse.Namespace) -> int:
         reward = named_reward_source(args.reward)
 
     from deepracer_exp.analysis.findings import findings
-    from deepracer_exp.analysis.lap_replay import laps_of_log
-    from deepracer_exp.analysis.log_report import LogPage, write_page
     from deepracer_exp.analysis.log_tables import headline, trainings
     from deepracer_exp.analysis.log_view import prepare
     from deepracer_exp.analysis.reward_replay import replay_reward
     from deepracer_exp.analysis.reward_terms import run_terms
+    from deepracer_exp.reports.lap_replay import laps_of_log
+    from deepracer_exp.reports.log_report import LogPage, write_page
     from deepracer_exp.runs.files import read_config, sees_pictures
     from deepracer_exp.runs.recording import is_traced_run, read_log
 
@@ -108,7 +108,7 @@ def _analyze(args: argparse.Namespace) -> int:
     line = None if args.line is None else recorded_line(view, episode)
     strip: list[Glimpse] = []
     if sees_pictures(config):
-        from deepracer_exp.evaluation.sight import run_glimpses
+        from deepracer_exp.reports.sight import run_glimpses
 
         view, strip = run_glimpses(view, place)
     if args.fastest:

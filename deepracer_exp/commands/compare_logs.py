@@ -30,9 +30,9 @@ def compare_recordings(args: argparse.Namespace, items: Sequence[Item]) -> int:
         policy_of,
         recordings_compared,
     )
-    from deepracer_exp.analysis.lap_replay import laps_of_log
     from deepracer_exp.analysis.log_tables import Table, headline
     from deepracer_exp.analysis.log_view import prepare
+    from deepracer_exp.reports.lap_replay import laps_of_log
     from deepracer_exp.runs.recording import read_log
 
     named: list[tuple[str | None, LogView]] = []
@@ -66,11 +66,11 @@ def against_log(args: argparse.Namespace, name: str, place: Path, stores: Stores
     chosen = stores.values.get(CHECKPOINT)
     run = check_policy(name, str(stores.runs_dir), stores.uri, chosen)
 
-    from deepracer_exp.analysis.against_log import prepare_races, write_against_log
     from deepracer_exp.analysis.charts.runs import recordings_compared
-    from deepracer_exp.analysis.lap_replay import laps_of_log
-    from deepracer_exp.analysis.log_view import prepare
+    from deepracer_exp.analysis.log_view import prepare, prepare_races
     from deepracer_exp.aws.logs.reader import read_recording
+    from deepracer_exp.reports.against_log import write_against_log
+    from deepracer_exp.reports.lap_replay import laps_of_log
     from deepracer_exp.runs.recording import read_log
 
     recording = read_recording(place)
@@ -78,7 +78,7 @@ def against_log(args: argparse.Namespace, name: str, place: Path, stores: Stores
 
     from rich.console import Console
 
-    from deepracer_exp.evaluation.against_log import race_against_log
+    from deepracer_exp.reports.driven_against_log import race_against_log
 
     with warnings_on_stderr():
         both = race_against_log(run, chosen, view, args.track, Console(stderr=True, highlight=False))

@@ -56,7 +56,7 @@ def compare_runs(args: argparse.Namespace, items: Sequence[Item], stores: Stores
         stored = [
             check_policy(str(record.path), str(stores.runs_dir), stores.uri, None) for record in records
         ]
-        from deepracer_exp.evaluation.driven_laps import laps_to_replay
+        from deepracer_exp.reports.driven_laps import laps_to_replay
 
         protocol = stored[0].experiment.evaluation
         (first,) = laps_to_replay(stored[0], None, protocol)

@@ -45,7 +45,7 @@ def write_page(
     Raises:
         BadInput: it cannot be written.
     """
-    from deepracer_exp.analysis.comparison_page import write_comparison
+    from deepracer_exp.reports.comparison_page import write_comparison
 
     words = list(dict.fromkeys(item.group or Path(item.word).name for item in items))
     out = Path(output or page_name("comparison", "-".join(words[:3])))

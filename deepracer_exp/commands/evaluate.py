@@ -188,7 +188,7 @@ def _watch(args: argparse.Namespace) -> int:
 
         from rich.console import Console
 
-        from deepracer_exp.evaluation.watch import film_run
+        from deepracer_exp.reports.watch import film_run
 
         file = None if args.output is None else Path(args.output)
         with warnings_on_stderr():
@@ -196,8 +196,8 @@ def _watch(args: argparse.Namespace) -> int:
         return 0
     from deepracer_exp.config.own_class import OF_POLICY
     from deepracer_exp.config.parse import import_own_classes
-    from deepracer_exp.evaluation.live_server import LiveServer
     from deepracer_exp.lookup.resolve import resolve
+    from deepracer_exp.reports.live_server import LiveServer
 
     # Its first checkpoint may be still to come.
     stored = resolve(config.run, Path(config.runs_dir), config.tracking.uri)
@@ -206,7 +206,7 @@ def _watch(args: argparse.Namespace) -> int:
     with LiveServer(args.port or 0) as server, warnings_on_stderr():
         print(server.url, flush=True)
 
-        from deepracer_exp.evaluation.live import serve_live
+        from deepracer_exp.reports.live import serve_live
         from deepracer_exp.training.budget import Budget
 
         serve_live(stored, protocol, server, Budget(stored.experiment.budget, stored.path).used)
@@ -231,15 +231,15 @@ def _replay_laps(args: argparse.Namespace) -> int:
 
         place = Path(runs[1]).expanduser()
         if place.exists() and not is_run(place):
-            from deepracer_exp.analysis.against_log import prepare_races
+            from deepracer_exp.analysis.log_view import prepare_races
             from deepracer_exp.aws.logs.reader import read_recording
 
             view = prepare_races(read_recording(place))
         else:
             rival = check_policy(runs[1], config.runs_dir, config.tracking.uri, None)
 
-    from deepracer_exp.analysis.lap_replay import fastest_lap_of_log
-    from deepracer_exp.evaluation.driven_laps import laps_to_replay
+    from deepracer_exp.reports.driven_laps import laps_to_replay
+    from deepracer_exp.reports.lap_replay import fastest_lap_of_log
 
     protocol = run.experiment.evaluation if own_trials else config.evaluation
     with warnings_on_stderr():
@@ -311,7 +311,7 @@ def _checkpoints(args: argparse.Namespace) -> int:
 
     from rich.console import Console
 
-    from deepracer_exp.evaluation.checkpoint_comparison import show_checkpoints
+    from deepracer_exp.reports.checkpoint_comparison import show_checkpoints
 
     progress = Console(stderr=True, highlight=False, markup=False)
     with warnings_on_stderr():

@@ -81,8 +81,8 @@ def print_start() -> None:
 
 def print_result(outcome: "TrainResult", tracking: "TrackingConfig") -> None:
     """Print how a run ended, where its results are, and what to do next."""
-    from deepracer_exp.analysis.next_steps import COMMAND, next_steps
     from deepracer_exp.config.running import MLflowTracking
+    from deepracer_exp.lookup.next_steps import COMMAND, next_steps
     from deepracer_exp.runs.result import result_of
 
     summary = outcome.summary
@@ -151,7 +151,7 @@ def _print_groups(runs: "Sequence[Path]") -> None:
     """Print the tables of groups, where one of them has several runs."""
     from deepracer_exp.analysis.group_tables import differences_table, scored, sentences
     from deepracer_exp.analysis.groups import compared, group_runs
-    from deepracer_exp.analysis.next_steps import own_word
+    from deepracer_exp.lookup.next_steps import own_word
     from deepracer_exp.runs.files import read_head
 
     groups = group_runs((None, read_head(run)) for run in runs) if len(runs) > 1 else []
@@ -170,8 +170,8 @@ def _print_groups(runs: "Sequence[Path]") -> None:
 
 def _print_unrecorded(outcomes: "Sequence[TrainResult]", tracking: "TrackingConfig") -> None:
     """Say last, on standard error, what was not recorded, and how to send it later."""
-    from deepracer_exp.analysis.next_steps import own_word
     from deepracer_exp.config.running import MLflowTracking
+    from deepracer_exp.lookup.next_steps import own_word
 
     lacking = [one for one in outcomes if one.unrecorded is not None]
     for reason in dict.fromkeys(one.unrecorded for one in lacking):

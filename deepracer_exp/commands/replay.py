@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from deepracer_exp.errors import BadInput, writing
 
 if TYPE_CHECKING:
-    from deepracer_exp.analysis.lap_replay import ReplayedLap
+    from deepracer_exp.reports.lap_replay import ReplayedLap
 
 
 def add_replay(parser: argparse.ArgumentParser, which: str) -> None:
@@ -34,7 +34,7 @@ def write_laps(page: str, laps: "Sequence[ReplayedLap]") -> None:
     Raises:
         BadInput: they are not on the same track, or it cannot be written.
     """
-    from deepracer_exp.analysis.lap_replay import write_replay
+    from deepracer_exp.reports.lap_replay import write_replay
 
     with writing(f"--replay {page}"):
         write_replay(Path(page), laps)

@@ -208,10 +208,10 @@ def _label(member: "Member", run: Path, best: dict[int, str]) -> "Text":
 
 
 def _promote(args: argparse.Namespace) -> int:
-    from deepracer_exp.analysis.next_steps import command_line
     from deepracer_exp.config.driving import ObservationConfig
     from deepracer_exp.config.own_class import OF_POLICY, allow_given
     from deepracer_exp.config.parse import parse_config
+    from deepracer_exp.lookup.next_steps import command_line
     from deepracer_exp.lookup.resolve import resolve
     from deepracer_exp.runs.checkpoint_files import find_checkpoint
     from deepracer_exp.runs.files import read_config

@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from deepracer_exp.analysis.next_steps import command_line, run_word
 from deepracer_exp.config.overrides import group_of
 from deepracer_exp.config.running import BudgetConfig
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.lifeline import given_environment, running
+from deepracer_exp.lookup.next_steps import command_line, run_word
 from deepracer_exp.runs.files import METRICS, SUMMARY, read_config, read_object
 from deepracer_exp.runs.result import FAILED, INTERRUPTED
 

@@ -6,17 +6,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from deepracer_exp.analysis.against_log import (
+from deepracer_exp.analysis.charts.layout import draw
+from deepracer_exp.analysis.log_view import prepare_races
+from deepracer_exp.errors import BadInput
+from deepracer_exp.reports.against_log import (
     AgainstLog,
     actions_compared,
     along_the_track,
     laps_on,
     lines_compared,
     logged_laps,
-    prepare_races,
 )
-from deepracer_exp.analysis.charts.layout import draw
-from deepracer_exp.errors import BadInput
 
 from .made_up import Drive, made_up_course, made_up_recording
 

@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 
 from deepracer_exp.analysis.charts.figure import Chart
 from deepracer_exp.analysis.findings import Finding, findings
-from deepracer_exp.analysis.log_report import LogPage, draw_sections, html
 from deepracer_exp.analysis.log_tables import NONE, best_laps, headline, iteration_rows
 from deepracer_exp.analysis.log_view import LEAST_EPISODES, LogView, prepare
 from deepracer_exp.analysis.off_track import neighbours
 from deepracer_exp.analysis.sectors import sectors_of
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.reports.log_report import LogPage, draw_sections, html
 from deepracer_exp.runs.recording import RunRecording
 from deepracer_exp.runs.result import RunResult
 from deepracer_exp.stopping.judge import LOG_RULE

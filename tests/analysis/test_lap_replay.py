@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepracer_exp.analysis.lap_replay import laps_of_log, write_replay
 from deepracer_exp.analysis.log_view import LogView, prepare
+from deepracer_exp.reports.lap_replay import laps_of_log, write_replay
 from tests.browser import needs_chromium
 from tests.conftest import refused
 from tests.page_html import Html

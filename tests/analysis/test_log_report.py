@@ -8,13 +8,13 @@ import pandas as pd
 import pytest
 
 from deepracer_exp.analysis.findings import FIGURES, findings
-from deepracer_exp.analysis.log_report import SECTIONS, LogPage, write_report
-from deepracer_exp.analysis.log_report import html as page_html
 from deepracer_exp.analysis.log_tables import MOST_ITERATIONS, facts, headline, iteration_rows
 from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.reward_replay import ReplayedRewards
 from deepracer_exp.aws.logs.recording import LogProblem, Recording
 from deepracer_exp.errors import BadInput
+from deepracer_exp.reports.log_report import SECTIONS, LogPage, write_report
+from deepracer_exp.reports.log_report import html as page_html
 from deepracer_exp.runs.recording import RunRecording
 from deepracer_exp.runs.result import RunResult
 from tests.browser import needs_chromium

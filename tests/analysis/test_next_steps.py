@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 
-from deepracer_exp.analysis.next_steps import next_steps, own_word, run_word
+from deepracer_exp.lookup.next_steps import next_steps, own_word, run_word
 from deepracer_exp.lookup.resolve import resolve
 from deepracer_exp.runs.files import read_object
 

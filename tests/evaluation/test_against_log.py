@@ -7,11 +7,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from deepracer_exp.analysis.against_log import AgainstLog, laps_on, logged_laps, prepare_races
+from deepracer_exp.analysis.log_view import prepare_races
 from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.aws.logs.writer import TRACE_HEADER
 from deepracer_exp.errors import BadInput
-from deepracer_exp.evaluation.against_log import course_driven, race_as_logged
+from deepracer_exp.reports.against_log import AgainstLog, laps_on, logged_laps
+from deepracer_exp.reports.driven_against_log import course_driven, race_as_logged
 from deepracer_exp.tracks.track import Track
 from tests.analysis.made_up import Drive, made_up_recording
 

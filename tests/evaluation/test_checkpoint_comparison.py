@@ -10,14 +10,14 @@ from rich.console import Console
 
 from deepracer_exp.analysis.charts.layout import draw
 from deepracer_exp.analysis.charts.runs import speed_and_stability
-from deepracer_exp.evaluation.checkpoint_comparison import (
+from deepracer_exp.evaluation.result import Evaluation
+from deepracer_exp.reports.checkpoint_comparison import (
     CheckpointResult,
     LapStatistics,
     comparison_table,
     lap_statistics,
     recommend,
 )
-from deepracer_exp.evaluation.result import Evaluation
 
 from .test_result import attempt, group
 

@@ -13,10 +13,10 @@ from deepracer_exp.analysis.log_tables import headline
 from deepracer_exp.analysis.log_view import prepare
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.setup import build_courses
+from deepracer_exp.reports.run_page import write_pictures
 from deepracer_exp.runs.files import read_record
 from deepracer_exp.runs.recording import read_run_recording
 from deepracer_exp.stopping.replay import replay
-from deepracer_exp.training.callbacks import write_pictures
 from tests.waiting import wait_until
 
 NOT_LEARNING = (

@@ -9,12 +9,12 @@ from typing import Any
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
-from deepracer_exp.analysis.next_steps import COMMAND, command_line
-from deepracer_exp.analysis.next_steps import outcome as run_outcome
-from deepracer_exp.analysis.page import plot, render
 from deepracer_exp.config.own_class import OF_POLICY
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.files import atomic_write, read_bytes
+from deepracer_exp.lookup.next_steps import COMMAND, command_line
+from deepracer_exp.lookup.next_steps import outcome as run_outcome
+from deepracer_exp.reports.page import plot, render
 from deepracer_exp.runs.files import BEST_LAP, read_config, read_head
 from deepracer_exp.sweeps.search.objectives import (
     MEASURES,

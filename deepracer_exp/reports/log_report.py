@@ -8,21 +8,37 @@ from typing import Any
 
 import pandas as pd
 
+from deepracer_exp.analysis.charts import (
+    actions,
+    against_fastest,
+    driving_line,
+    laps,
+    mistakes,
+    rewards,
+    training,
+    zigzag,
+)
+from deepracer_exp.analysis.charts.figure import Chart
+from deepracer_exp.analysis.charts.runs import generalisation_matrix, generations, policy_of, run_folder
+from deepracer_exp.analysis.findings import Finding, findings
+from deepracer_exp.analysis.log_tables import (
+    best_laps,
+    candidate_rows,
+    facts,
+    headline,
+    iteration_rows,
+    problem_rows,
+)
+from deepracer_exp.analysis.log_view import LogView, prepare
+from deepracer_exp.analysis.reward_replay import ReplayedRewards
 from deepracer_exp.aws.logs.recording import Recording, readable
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.files import atomic_write
+from deepracer_exp.lookup.next_steps import next_steps, official_place, outcome
 from deepracer_exp.runs.files import read_head
 from deepracer_exp.runs.recording import RunRecording
 
-from .charts import actions, against_fastest, driving_line, laps, mistakes, rewards, training, zigzag
-from .charts.figure import Chart
-from .charts.runs import generalisation_matrix, generations, policy_of, run_folder
-from .findings import Finding, findings
-from .log_tables import best_laps, candidate_rows, facts, headline, iteration_rows, problem_rows
-from .log_view import LogView, prepare
-from .next_steps import next_steps, official_place, outcome
 from .page import Glimpse, Plot, plot_of, render
-from .reward_replay import ReplayedRewards
 
 MOST_FILES = 400
 _BESIDE, _PAID = "Generations and tracks", "What the reward pays for"

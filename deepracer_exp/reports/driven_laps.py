@@ -7,18 +7,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from deepracer_exp.analysis.lap_replay import ReplayedLap, is_same_start
 from deepracer_exp.analysis.proposed_actions import Commands, fast_laps, in_words
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.env.trace import PACKED, STATUS_CODE
 from deepracer_exp.errors import BadInput, count
+from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.evaluation.film import LapRecorder, best_attempt
+from deepracer_exp.evaluation.race_protocol import Attempt
+from deepracer_exp.evaluation.result import USUAL, Evaluation
 from deepracer_exp.lookup.resolve import StoredRun
+from deepracer_exp.reports.lap_replay import ReplayedLap, is_same_start
 from deepracer_exp.runs.checkpoints import StoredPolicy, read_checkpoint
-
-from .evaluator import Evaluator
-from .film import LapRecorder, best_attempt
-from .race_protocol import Attempt
-from .result import USUAL, Evaluation
 
 
 def laps_to_replay(

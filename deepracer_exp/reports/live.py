@@ -16,20 +16,20 @@ from rich.table import Table
 
 from deepracer_exp.analysis.charts.live import curves_so_far, newest_laps
 from deepracer_exp.analysis.charts.run_pictures import TrackLines
-from deepracer_exp.analysis.next_steps import outcome, state
-from deepracer_exp.analysis.page import Glimpse, Plot, plot_of, render
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.errors import BadInput
+from deepracer_exp.evaluation.evaluate import results_table, trained_on
+from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.evaluation.film import LapRecorder, best_attempt
+from deepracer_exp.evaluation.result import USUAL, Evaluation
+from deepracer_exp.lookup.next_steps import outcome, state
 from deepracer_exp.lookup.resolve import StoredRun
+from deepracer_exp.reports.page import Glimpse, Plot, plot_of, render
 from deepracer_exp.runs.checkpoints import StoredPolicy, check, read_policy
 from deepracer_exp.runs.files import METRICS, SUMMARY, read_head, read_metrics
 from deepracer_exp.runs.folder import is_held
 
-from .evaluate import results_table, trained_on
-from .evaluator import Evaluator
-from .film import LapRecorder, best_attempt
 from .live_server import LiveServer
-from .result import USUAL, Evaluation
 from .sight import glimpses
 
 _EVERY_S = 1.0

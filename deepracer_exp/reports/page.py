@@ -16,9 +16,9 @@ from plotly.graph_objects import Figure
 from plotly.offline import get_plotlyjs
 from plotly.utils import PlotlyJSONEncoder
 
-from .charts.figure import Chart
-from .charts.layout import draw
-from .charts.style import DARK, NARROW_WIDTH
+from deepracer_exp.analysis.charts.figure import Chart
+from deepracer_exp.analysis.charts.layout import draw
+from deepracer_exp.analysis.charts.style import DARK, NARROW_WIDTH
 
 
 @dataclass(frozen=True)

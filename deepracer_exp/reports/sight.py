@@ -15,18 +15,17 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from deepracer_exp.analysis.log_view import LogView
-from deepracer_exp.analysis.page import Glimpse, png_uri
 from deepracer_exp.aws.logs.recording import LogProblem
 from deepracer_exp.config.driving import CameraConfig
 from deepracer_exp.config.own_class import OF_POLICY, named_again
 from deepracer_exp.env.action_space import ActionSpace
 from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.evaluation.film import Lap, drive_best_lap, png
 from deepracer_exp.lookup.resolve import StoredRun
+from deepracer_exp.reports.page import Glimpse, png_uri
 from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import read_config
-
-from .evaluator import Evaluator
-from .film import Lap, drive_best_lap, png
 
 SPACING, SPREAD = 12, 18
 """Blurred places along the picture's width, and the width in standard deviations of one of them."""

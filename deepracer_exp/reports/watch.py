@@ -21,14 +21,14 @@ from deepracer_exp.config.evaluation import EvaluateConfig
 from deepracer_exp.env.action_space import ActionSpace, DiscreteActions
 from deepracer_exp.env.lidar import reach_of_rays
 from deepracer_exp.errors import RunFailed, count, writing
+from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.evaluation.film import Lap, drive_best_lap, in_frames, write_film
 from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import FILMS
 from deepracer_exp.sim.lidar import ANGLES_RAD, MOUNT_X_M
 from deepracer_exp.tracks.picture import draw_track, extent
 
-from .evaluator import Evaluator
-from .film import Lap, drive_best_lap, in_frames, write_film
 from .sight import degrees, picture_of, saliency, under_heat
 
 WIDTH, HEIGHT = 1280, 720

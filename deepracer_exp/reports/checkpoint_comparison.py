@@ -13,18 +13,26 @@ from rich.console import Console
 from rich.table import Table
 
 from deepracer_exp.analysis.charts.runs import evaluated_laps, speed_and_stability
-from deepracer_exp.analysis.comparison_page import write_comparison
 from deepracer_exp.analysis.log_tables import Table as PageTable
 from deepracer_exp.config.evaluation import EvaluateConfig
 from deepracer_exp.errors import BadInput, count, writing
+from deepracer_exp.evaluation.evaluate import fit
+from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.evaluation.result import (
+    CONFIDENCE,
+    HELD_OUT,
+    NOTHING,
+    USUAL,
+    Evaluation,
+    Metric,
+    Rank,
+    number,
+)
 from deepracer_exp.lookup.resolve import StoredRun
+from deepracer_exp.reports.comparison_page import write_comparison
 from deepracer_exp.runs.checkpoint_files import LINKS, kept_checkpoints, pinned
 from deepracer_exp.runs.checkpoints import check, read_policy
 from deepracer_exp.runs.result import BOTH, CRITERIA
-
-from .evaluate import fit
-from .evaluator import Evaluator
-from .result import CONFIDENCE, HELD_OUT, NOTHING, USUAL, Evaluation, Metric, Rank, number
 
 logger = logging.getLogger("deepracer_exp")
 

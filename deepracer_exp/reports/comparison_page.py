@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from deepracer_exp.analysis.charts.figure import Chart
+from deepracer_exp.analysis.log_tables import Table
 from deepracer_exp.files import atomic_write
 
-from .charts.figure import Chart
-from .log_tables import Table
 from .page import plot_of, render
 
 

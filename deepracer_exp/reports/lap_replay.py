@@ -8,20 +8,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from deepracer_exp.analysis.charts.figure import Chart, Layer, Panel, line, points
+from deepracer_exp.analysis.charts.laps import ordinary_lap
+from deepracer_exp.analysis.charts.maps import map_panel
+from deepracer_exp.analysis.charts.style import BLUE, ORANGE, PAPER
+from deepracer_exp.analysis.line_file import driven_speed_mps
+from deepracer_exp.analysis.log_tables import Table
+from deepracer_exp.analysis.log_view import LogView
+from deepracer_exp.analysis.statistics import Values
+from deepracer_exp.analysis.tables import first_rows
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import atomic_write
 from deepracer_exp.tracks.track import Track
 
-from .charts.figure import Chart, Layer, Panel, line, points
-from .charts.laps import ordinary_lap
-from .charts.maps import map_panel
-from .charts.style import BLUE, ORANGE, PAPER
-from .line_file import driven_speed_mps
-from .log_tables import Table
-from .log_view import LogView
 from .page import plot_of, render
-from .statistics import Values
-from .tables import first_rows
 
 COLORS = (BLUE, ORANGE)
 _DIGITS = 4

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from rich.console import Console
 from torch import nn
 
-from deepracer_exp.analysis.against_log import AgainstLog, laps_on, logged_laps
 from deepracer_exp.analysis.log_course import catalogue_track, directed, numbered_as_logged, was_driven_on
 from deepracer_exp.analysis.log_view import LogView
 from deepracer_exp.analysis.statistics import subsample
@@ -22,12 +21,12 @@ from deepracer_exp.config.overrides import override_line
 from deepracer_exp.config.track import TrackConfig
 from deepracer_exp.env.trace import to_table
 from deepracer_exp.errors import BadInput, count
+from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.evaluation.film import LapRecorder
 from deepracer_exp.lookup.resolve import StoredRun
+from deepracer_exp.reports.against_log import AgainstLog, laps_on, logged_laps
 from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.tracks.track import Track
-
-from .evaluator import Evaluator
-from .film import LapRecorder
 
 STREAM = "simulated"
 MOST_STARTS = 20

@@ -8,23 +8,23 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from deepracer_exp.aws.logs.recording import STEP_COLUMNS, TRAINING, Recording
+from deepracer_exp.analysis.charts.actions import COLUMNS, ActionClasses, classify
+from deepracer_exp.analysis.charts.figure import Chart, Layer, Panel, band, bars, in_rows, line
+from deepracer_exp.analysis.charts.laps import time_lost_panel
+from deepracer_exp.analysis.charts.maps import beside, map_panel
+from deepracer_exp.analysis.charts.style import BLUE, ORANGE, VERMILION
+from deepracer_exp.analysis.log_course import waypoint_positions
+from deepracer_exp.analysis.log_tables import NONE, Table, facts, problem_rows
+from deepracer_exp.analysis.log_view import DISCOUNT, PREPARE, LogView
+from deepracer_exp.analysis.sectors import interval_times, sector_at, sectors_of
+from deepracer_exp.analysis.statistics import Values, totals
+from deepracer_exp.analysis.tables import add_derived, episode_table, first_rows
+from deepracer_exp.aws.logs.recording import STEP_COLUMNS
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.files import atomic_write
 from deepracer_exp.tracks.track import Track
 
-from .charts.actions import COLUMNS, ActionClasses, classify
-from .charts.figure import Chart, Layer, Panel, band, bars, in_rows, line
-from .charts.laps import time_lost_panel
-from .charts.maps import beside, map_panel
-from .charts.style import BLUE, ORANGE, VERMILION
-from .log_course import waypoint_positions
-from .log_tables import NONE, Table, facts, problem_rows
-from .log_view import DISCOUNT, PREPARE, LogView, prepare
 from .page import plot_of, render
-from .sectors import interval_times, sector_at, sectors_of
-from .statistics import Values, totals
-from .tables import add_derived, episode_table, first_rows
 
 PLACES = np.arange(100) / 100
 """Lap positions at which laps are compared."""
@@ -117,16 +117,6 @@ def laps_on(course: Track, steps: pd.DataFrame, words: str, chosen: bool = False
     if "lap_clock_s" in steps:  # a metrics file may have set it
         rows["lap_clock_s"] = steps["lap_clock_s"].to_numpy()
     return Laps(steps=rows, episodes=episode_table(rows), words=words, chosen=chosen)
-
-
-def prepare_races(recording: Recording, track: str | None = None) -> LogView:
-    """Prepare the evaluations and races of a log, or if there are none its training.
-
-    Raises:
-        BadInput: as for `prepare`.
-    """
-    raced = (recording.steps["stream"] != TRAINING).to_numpy()
-    return prepare(replace(recording, steps=recording.steps[raced]) if raced.any() else recording, track)
 
 
 def logged_laps(view: LogView, course: Track) -> Laps:

@@ -1,0 +1,60 @@
+"""What a training leaves to look at: its pictures and its page."""
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+from deepracer_exp.config.car import CarConfig
+from deepracer_exp.env.setup import Course
+from deepracer_exp.runs.files import BEST_LAP, LEARNING, METRICS, REPORT, TRACE, read_config, sees_pictures
+from deepracer_exp.runs.trace import read_trace
+
+logger = logging.getLogger("deepracer_exp")
+
+
+def write_pictures(run_dir: Path, courses: Sequence[Course]) -> None:
+    """Draw `best_lap.png` and `learning.png` from the run's trace and metrics, if it has an iteration."""
+    # Imported here: it takes half a second, which the start of a training need not wait for.
+    import pandas as pd
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    from deepracer_exp.analysis.charts.run_pictures import LINE_COLUMNS, driven_lines, learning_curves
+
+    metrics_file = run_dir / METRICS
+    if not metrics_file.is_file() or not metrics_file.stat().st_size:
+        return
+    trace = read_trace(run_dir / TRACE, LINE_COLUMNS)
+    tracks = {course.name: course.tracks[0] for course in courses}
+    curves = learning_curves(pd.read_json(metrics_file, lines=True))
+    for name, figure in ((BEST_LAP, driven_lines(trace, tracks)), (LEARNING, curves)):
+        figure.set_dpi(120)
+        # `savefig` draws a figure twice, the first time for its layout alone.
+        FigureCanvasAgg(figure).print_png(run_dir / name)
+
+
+def write_run_page(run_dir: Path, car: CarConfig) -> str | None:
+    """Write `report.html`; return a line if that fails: no error here ends a training."""
+    try:
+        from deepracer_exp.analysis.findings import findings
+        from deepracer_exp.analysis.log_view import prepare
+        from deepracer_exp.analysis.reward_terms import run_terms
+        from deepracer_exp.runs.recording import read_run_recording
+
+        from .log_report import LogPage, write_page
+        from .page import Glimpse
+
+        view, terms = run_terms(prepare(read_run_recording(run_dir)), car, just_trained=True)
+        strip: list[Glimpse] = []
+        if sees_pictures(read_config(run_dir)):
+            from .sight import run_glimpses
+
+            view, strip = run_glimpses(view, run_dir, just_trained=True)
+        write_page(run_dir / REPORT, LogPage(view, findings(view), terms=terms, strip=strip))
+    except KeyboardInterrupt:
+        return f"{REPORT} was left off; `deepracer-exp analyze {run_dir.name}` writes it"
+    except Exception as error:
+        note = f"{REPORT} could not be written: {' '.join(f'{type(error).__name__}: {error}'.split())}"
+        # Commands print the line; warnings would be shown twice.
+        logger.info(note, exc_info=True)
+        return f"{note}; log.txt has the traceback"
+    return None
