@@ -246,8 +246,9 @@ def _clone(args: argparse.Namespace) -> int:
 _SWEEP_EPILOG = """\
 what to search, in Hydra's grammar
   deepracer-exp sweep algorithm.lr='tag(log,interval(1e-5,1e-3))' network=mlp_small,mlp
-  deepracer-exp sweep sweep=lr_entropy track=Oval_track     a ready-made sweep: lr_entropy, reward_weights,
-                                                            action_space, network, everything
+  deepracer-exp sweep sweep=lr_entropy track=Oval_track     a ready-made study: lr_entropy, reward_weights,
+                                                            action_space, network, everything, or
+                                                            NAME of ./sweeps/NAME.yaml
   KEY='interval(LOW,HIGH)'  'tag(log,interval(LOW,HIGH))'  'int(interval(LOW,HIGH))'  A,B  'range(FROM,BELOW,STEP)'
   GROUP='glob(*)'                                           all options of a group
 

@@ -293,14 +293,9 @@ class TrialRun(Callback):
         """Make the run of the present seed, and evaluate it."""
         began = time.monotonic()
         self._pruned_by = None
-        begun = self._run
-        if begun is not None and (lost := self._lost_again(begun)) is not None:
+        if self._run is not None and (lost := self._lost_again(self._run)) is not None:
             return lost
-        # By its name: a study never leads to a folder elsewhere.
-        folder = None if begun is None else self._config.folder / Path(begun.run_dir or "").name
-        outcome = None if folder is None else self._resumed(folder)
-        if outcome is None:
-            outcome = self._trained(overrides)
+        outcome = (self._run and self._resumed(self._run)) or self._trained(overrides)
         if outcome.status == INTERRUPTED:
             raise Interrupted
         decision = outcome.summary.get("stopping") or {}
@@ -342,8 +337,10 @@ class TrialRun(Callback):
         title, tags = self._title_and_tags()
         return run_training(experiment, composition, None, start, [self], run_name=title, tags=tags)
 
-    def _resumed(self, run_dir: Path) -> TrainResult | None:
+    def _resumed(self, run: SeedRun) -> TrainResult | None:
         """Resume a run that was begun; None if there is nothing to resume."""
+        # By its name: a study never leads to a folder elsewhere.
+        run_dir = self._config.folder / Path(run.run_dir or "").name
         if not is_run(run_dir):
             return None
         if is_held(run_dir):
