@@ -24,12 +24,12 @@ from .custom_files import FileOverrides, file_overrides, read_custom_files
 from .dimension import range_length
 from .evaluation import EvaluateConfig, EvaluationConfig, ExportConfig
 from .experiment import Experiment
-from .option_files import composed, composed_option, first_line, plain, remove_key, set_value
+from .option_files import change, composed, composed_option, first_line, plain
 from .options import groups, listed, options
-from .overrides import PLAIN_TEXT, may_be_new, override_line, parse_single, parse_sweep
+from .overrides import PLAIN_TEXT, override_line, parse_single, parse_sweep
 from .own_class import allow, allow_given, own_option
 from .parse import import_own_classes, parse_config, parse_experiment
-from .track_options import ALL, by_world_name, complete, several_tracks, world_values
+from .track_options import ALL, by_world_name, several_tracks
 from .track_options import GROUP as TRACK
 
 Config = TypeVar("Config")
@@ -127,30 +127,27 @@ def compose_entry(entry: str, overrides: Sequence[str], *, stored: bool = False)
     own = [*map(parse_single, files.lines), *own]
     chosen = [override for override in own if override.key_or_group in groups(entry)]
     changing = [override for override in own if override.key_or_group not in groups(entry)]
-    several = several_tracks(chosen, changing) if TRACK in groups(entry) else None
-    if several is not None:
+    names: tuple[str, ...] = ()
+    if TRACK in groups(entry):
+        names, changing = several_tracks(chosen, changing)
+    if names:
         chosen = [override for override in chosen if override.key_or_group != TRACK]
-        changing = list(several.changing)
     with reading(" ".join(overrides) or entry):
         config, choices = composed(entry, [_choice(override) for override in chosen])
-        if several is not None:
-            config[TRACK] = {name: _track(name) for name in several.names}
-            choices[TRACK] = f"[{','.join(several.names)}]"
+        if names:
+            config[TRACK] = {name: composed_option(TRACK, name) for name in names}
+            choices[TRACK] = f"[{','.join(names)}]"
         try:
             for override in changing:
-                _change(entry, config, choices, override)
+                if not change(config, override):
+                    raise BadInput(_unknown_key(entry, override.key_or_group, config, choices))
             mapping = plain(config)
         except OmegaConfBaseException as error:
             raise BadInput(f"{error.full_key or entry}: {first_line(error)}") from error
-    if TRACK in mapping and TRACK in groups(entry):
-        if TRACK not in choices:
-            raise BadInput(
-                "track: an option file cannot choose several tracks; give them as an override: track=[A,B]"
-            )
-        if several is not None:
-            mapping[TRACK] = {name: complete(name, values) for name, values in mapping[TRACK].items()}
-        elif isinstance(mapping[TRACK], dict):
-            mapping[TRACK] = complete(choices[TRACK], mapping[TRACK])
+    if TRACK in mapping and TRACK in groups(entry) and TRACK not in choices:
+        raise BadInput(
+            "track: an option file cannot choose several tracks; give them as an override: track=[A,B]"
+        )
     # Option files of the user may contain addresses, too.
     mapping, left_out = without_passwords(mapping), list[str]()
     if stored:
@@ -171,24 +168,6 @@ def _choice(override: Override) -> str:
     if override.is_delete():
         return override.get_key_element()
     return override_line(override.key_or_group, override.value())
-
-
-def _track(name: str) -> DictConfig:
-    """Return the values of one track of several."""
-    world = world_values(name)
-    return composed_option(TRACK, name) if world is None else OmegaConf.create(world)
-
-
-def _change(entry: str, config: DictConfig, choices: Mapping[str, str], override: Override) -> None:
-    """Set or remove the value that an override names."""
-    key = override.key_or_group
-    done = (
-        remove_key(config, key)
-        if override.is_delete()
-        else set_value(config, key, override.value(), is_new=may_be_new(override))
-    )
-    if not done:
-        raise BadInput(_unknown_key(entry, key, config, choices))
 
 
 def compose_option(group: str, option: str, kind: type[Config]) -> Config:

@@ -16,20 +16,21 @@ from typing import Any
 from hydra import compose, initialize_config_dir
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.object_type import ObjectType
+from hydra.core.override_parser.types import Override
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, MissingConfigException
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf, open_dict
-from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+from omegaconf.errors import OmegaConfBaseException
 
 from deepracer_exp.errors import BadInput, nearest
 from deepracer_exp.files import read_yaml
 
-from .options import SWEEP, conf_dirs, find, groups, options, sweep_files
-from .overrides import override_line
+from .options import SWEEP, conf_dir, conf_dirs, find, groups, options, sweep_files
+from .overrides import may_be_new, override_line
+from .track_options import BASE, world_values
 from .track_options import GROUP as TRACK
-from .track_options import world_values
 
 _EMPTY = str(Path(__file__).parent)
 _PACKAGE = re.compile(r"(?:\s*#.*\n)*?\s*#\s*@package\s+(\S+)")
@@ -65,11 +66,16 @@ class OptionFiles(ConfigSource):
         Raises:
             BadInput: the file cannot be read, or is not YAML with keys and values.
         """
-        if (world := self._world(config_path)) is not None:
-            return ConfigResult(self.provider, self.full_path(), OmegaConf.create(world), {"package": None})
+        group, option = _place(config_path)
+        if (world := _world(group, option)) is not None:
+            return ConfigResult(
+                self.provider, self.full_path(), track_values(option, world), {"package": None}
+            )
 
         def load(text: str) -> ConfigResult:
             config, package = copy.deepcopy(_parsed(text)), _PACKAGE.match(text)
+            if group == TRACK and "defaults" not in config:
+                config = track_values(option, config)
             return ConfigResult(self.provider, self.full_path(), config, {"package": package and package[1]})
 
         return read_yaml(self._file(config_path), "an option file with lines KEY: VALUE", load)
@@ -78,7 +84,7 @@ class OptionFiles(ConfigSource):
         """Return whether there is such an option; a pipe or a broken link is refused when it is read."""
         path = self._file(config_path)
         is_file = self._is_below(config_path) and os.path.lexists(path) and not path.is_dir()
-        return is_file or self._world(config_path) is not None
+        return is_file or _world(*_place(config_path)) is not None
 
     def is_group(self, config_path: str) -> bool:
         """Return whether there is such a folder."""
@@ -89,19 +95,11 @@ class OptionFiles(ConfigSource):
         return Path(self.path).is_dir()
 
     def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
-        """Return the names of the options and groups in a folder, for Hydra's own messages."""
-        files = [path.stem for path in Path(self.path, config_path).glob("*.yaml")]
-        folders = [path.name for path in Path(self.path, config_path).glob("*/")]
-        kinds = {ObjectType.CONFIG: files, ObjectType.GROUP: folders, None: files + folders}
-        return sorted(kinds.get(results_filter, []))
-
-    @staticmethod
-    def _world(config_path: str) -> dict[str, Any] | None:
-        group, _, option = config_path.rpartition("/")
-        return world_values(option.removesuffix(".yaml")) if group == TRACK else None
+        """Return no names: Hydra asks for them for messages that are not shown."""
+        return []
 
     def _file(self, config_path: str) -> Path:
-        group, _, name = config_path.removesuffix(".yaml").rpartition("/")
+        group, name = _place(config_path)
         study = sweep_files().get(name) if group == SWEEP else None
         return study or Path(self.path, group, f"{name}.yaml")
 
@@ -109,6 +107,25 @@ class OptionFiles(ConfigSource):
     def _is_below(config_path: str) -> bool:
         # Names in `defaults:` of an option file must not lead out of the folder either.
         return not Path(config_path).is_absolute() and ".." not in Path(config_path).parts
+
+
+def _place(config_path: str) -> tuple[str, str]:
+    """Return group and name of an option."""
+    group, _, option = config_path.removesuffix(".yaml").rpartition("/")
+    return group, option
+
+
+def _world(group: str, option: str) -> DictConfig | None:
+    values = world_values(option) if group == TRACK else None
+    return None if values is None else OmegaConf.create(values)
+
+
+def track_values(option: str, values: DictConfig) -> DictConfig:
+    """Return a track's values, with those of `BASE` for missing keys and the option's name for a missing name."""
+    base = _parsed((conf_dir() / TRACK / f"{BASE}.yaml").read_text(encoding="utf-8"))
+    merged = OmegaConf.merge(base, {"name": option, "title": values.get("name", option)}, values)
+    assert isinstance(merged, DictConfig)
+    return merged
 
 
 class OptionFolders(SearchPathPlugin):
@@ -140,9 +157,11 @@ def composed(entry: str | None, lines: Sequence[str]) -> tuple[DictConfig, dict[
         with initialize_config_dir(_EMPTY, version_base="1.3"):
             config = compose(entry, overrides=list(lines), return_hydra_config=True)
     except MissingConfigException as error:
-        raise BadInput(_missing(entry or "train", error.missing_cfg_file or "")) from error
+        group, _, option = (error.missing_cfg_file or "").rpartition("/")
+        hint = nearest(option, options(group)) if group in groups(entry or "train") else ""
+        raise BadInput(f"{group}={option}: no such {group or 'option'}{hint}") from error
     except (HydraException, OmegaConfBaseException) as error:
-        raise BadInput(f"{entry or ' '.join(lines)}: {first_line(error)}") from error
+        raise BadInput(f"{entry or lines}: {first_line(error)}") from error
     chosen = config.hydra.runtime.choices.items()
     choices = {str(key): str(option).removesuffix(".yaml") for key, option in chosen if option is not None}
     with open_dict(config):
@@ -151,48 +170,41 @@ def composed(entry: str | None, lines: Sequence[str]) -> tuple[DictConfig, dict[
 
 
 def composed_option(group: str, option: str) -> DictConfig:
-    """Let Hydra compose an option by itself; raises as `composed`."""
+    """Return the values of an option by itself; raises as `composed`."""
+    if (world := _world(group, option)) is not None:
+        return track_values(option, world)
     values = composed(None, [f"+{override_line(group, option)}"])[0][group]
     assert isinstance(values, DictConfig)
     return values
 
 
-def set_value(config: DictConfig, key: str, value: Any, *, is_new: bool) -> bool:
-    """Set a dotted key; return False if there is no such key and it `is_new` is not meant."""
+def change(config: DictConfig, override: Override) -> bool:
+    """Set or remove the value that an override names; return False if there is no such key."""
+    key = override.key_or_group
     try:
-        OmegaConf.update(config, key, value, merge=True, force_add=is_new)
-    except (ConfigAttributeError, ConfigKeyError):
+        if not override.is_delete():
+            OmegaConf.update(config, key, override.value(), merge=True, force_add=may_be_new(override))
+            return True
+        above, _, leaf = key.rpartition(".")
+        with open_dict(config):
+            del (OmegaConf.select(config, above) if above else config)[leaf]
+    except (AttributeError, KeyError, TypeError):  # OmegaConf's are such, too
         return False
     return True
 
 
-def remove_key(config: DictConfig, key: str) -> bool:
-    """Remove a dotted key; return False if there is none."""
-    above, _, leaf = key.rpartition(".")
-    node = OmegaConf.select(config, above) if above else config
-    if not isinstance(node, DictConfig) or leaf not in node:
-        return False
-    with open_dict(node):
-        del node[leaf]
-    return True
-
-
-def plain(config: DictConfig) -> dict[str, Any]:
-    """Return composed values as plain Python: text for all keys, and for values that JSON does not have.
+def plain(value: Any) -> Any:
+    """Return values as plain Python: text for all keys, and for values that JSON does not have.
 
     Raises:
         OmegaConfBaseException: an interpolation leads nowhere, or a value is missing.
     """
-    values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    assert isinstance(values, dict)
-    return _plain(values)
-
-
-def _plain(value: Any) -> Any:
+    if isinstance(value, DictConfig):
+        value = OmegaConf.to_container(value, resolve=True, throw_on_missing=True)
     if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     return value if value is None or isinstance(value, str | int | float) else str(value)
 
 
@@ -200,13 +212,3 @@ def first_line(error: Exception) -> str:
     """Return the first line of an error of Hydra or OmegaConf; an empty one of Hydra's has it in its cause."""
     text = str(error) or str(error.__cause__ or type(error).__name__)
     return text.splitlines()[0]
-
-
-def _missing(entry: str, path: str) -> str:
-    """Return the message for an option that an option file names and that is not there."""
-    within = [group for group in groups(entry) if path.startswith(f"{group}/")]
-    if not within:
-        return f"{path}: no such option file"
-    group = max(within, key=len)  # sweep/executor rather than sweep
-    option = path.removeprefix(f"{group}/")
-    return f"{group}={option}: no such {group}{nearest(option, options(group))}"

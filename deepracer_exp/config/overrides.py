@@ -14,8 +14,6 @@ from .own_class import GROUPS
 
 # An override may add keys to these mappings.
 OPEN_MAPPINGS = ("reward.constants", *(f"{group}.kwargs" for group in GROUPS))
-# Options of these groups may omit keys, which are filled in and checked after Hydra.
-COMPLETED = ("track",)
 # Values of these keys are taken literally: without quotes, Hydra's grammar accepts no umlaut, bracket or second
 # equals sign in a value, and a comma makes a sweep.
 PLAIN_TEXT = (
@@ -65,7 +63,7 @@ def parse_sweep(override: str) -> Override:
 
 def may_be_new(override: Override) -> bool:
     """Return whether an override may add a key that the chosen options do not have."""
-    inside = any(override.key_or_group.startswith(f"{mapping}.") for mapping in (*OPEN_MAPPINGS, *COMPLETED))
+    inside = any(override.key_or_group.startswith(f"{mapping}.") for mapping in OPEN_MAPPINGS)
     return inside or override.is_add() or override.is_force_add()
 
 

@@ -201,14 +201,14 @@ def compose_sweep(overrides: Sequence[str], *, stored: bool = False) -> SweepReq
     chosen = set(typed_keys) & set(groups())
     ready = set(entry.sweep.space) - set(typed_keys)
     optional = frozenset(key for key in ready if key.partition(".")[0] in chosen)
-    return SweepRequest(entry, composition, tuple(train.base), train.space, optional, stored)
+    return SweepRequest(entry, composition, tuple(train.base.values()), train.space, optional, stored)
 
 
 class _TrainOverrides:
     """Overrides of the training in their order; the last one of a key counts."""
 
     def __init__(self) -> None:
-        self.base: list[str] = []
+        self.base: dict[str, str] = {}
         self.space: dict[str, str] = {}
 
     def add(self, override: str) -> str:
@@ -218,7 +218,7 @@ class _TrainOverrides:
         if key == "name":
             raise BadInput(f"{override}: the study's name is the experiment of its runs; write study=NAME")
         searched = self.space.pop(key, None) is not None
-        self.base = [line for line in self.base if parse_sweep(line).key_or_group != key]
+        self.base.pop(key, None)
         if parsed.is_sweep_override():
             _check_searched(key, override)
             self.space[key] = plain_expression(parsed, override.partition("=")[2])
@@ -227,7 +227,7 @@ class _TrainOverrides:
                 for value in found.values:
                     check_choice(key, override_value(as_override(key, value)))
         elif not (parsed.is_delete() and searched):
-            self.base.append(override)
+            self.base[key] = override
         return key
 
 

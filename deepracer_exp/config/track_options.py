@@ -5,13 +5,10 @@ Worlds need no files: Hydra finds them by name. Keys that an option omits have t
 """
 
 import re
-from collections.abc import Mapping, Sequence
-from copy import deepcopy
-from dataclasses import dataclass, fields, replace
-from functools import cache
+from collections.abc import Sequence
+from dataclasses import fields, replace
 from typing import Any
 
-import yaml
 from hydra.core.override_parser.types import Override
 
 from deepracer_exp.aws.worlds.catalogue import find_world, leaders, worlds
@@ -63,15 +60,6 @@ _FLOORS: dict[str, dict[str, Any]] = {
 }
 
 
-@dataclass(frozen=True)
-class SeveralTracks:
-    """Several chosen tracks, and the overrides of their values."""
-
-    names: tuple[str, ...]
-    changing: tuple[Override, ...]
-    """All overrides of values: those of all tracks before those of single ones, which have priority."""
-
-
 def world_values(option: str) -> dict[str, Any] | None:
     """Return the values of a world that has no file in `conf/track`; None for any other option."""
     world = worlds().get(option)
@@ -82,26 +70,6 @@ def world_values(option: str) -> dict[str, Any] | None:
         known = (floor for pattern, floor in _FLOORS.items() if re.match(pattern, world.name))
         values["floor"] = _LATER_FLOOR | next(known, {})
     return values
-
-
-def complete(option: str, values: Mapping[Any, Any]) -> dict[Any, Any]:
-    """Return a track's values, with those of `BASE` for missing keys and the option's name for a missing name."""
-    return _merged(_base() | {"name": option, "title": values.get("name", option)}, values)
-
-
-@cache
-def _base() -> dict[Any, Any]:
-    values = yaml.safe_load((conf_dir() / GROUP / f"{BASE}.yaml").read_text(encoding="utf-8"))
-    assert isinstance(values, dict)
-    return values
-
-
-def _merged(below: Mapping[Any, Any], values: Mapping[Any, Any]) -> dict[Any, Any]:
-    merged = deepcopy(dict(below))
-    for key, value in values.items():
-        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
-        merged[key] = _merged(merged[key], value) if both else value
-    return merged
 
 
 def by_world_name(override: Override) -> Override:
@@ -118,12 +86,18 @@ def by_world_name(override: Override) -> Override:
     return override if named == value else parse_single(override_line(GROUP, named))
 
 
-def several_tracks(choosing: Sequence[Override], changing: Sequence[Override]) -> SeveralTracks | None:
-    """Return the several tracks that overrides choose; None if they choose one, or none.
+def several_tracks(
+    choosing: Sequence[Override], changing: Sequence[Override]
+) -> tuple[tuple[str, ...], list[Override]]:
+    """Return the several tracks that overrides choose, and the overrides of values with a track's name in their keys.
 
     Args:
         choosing: overrides of groups.
         changing: overrides of values.
+
+    Returns:
+        Names; none if one track or none is chosen. Overrides of all tracks before those of single ones, which have
+        priority.
 
     Raises:
         BadInput: a track is unknown or chosen twice, the list is empty, or a value is set for a track not chosen.
@@ -139,7 +113,7 @@ def several_tracks(choosing: Sequence[Override], changing: Sequence[Override]) -
         _check(chosen[-1].input_line or "", names, known)
     else:
         _check_single(changing, known)
-        return None
+        return (), list(changing)
     others: list[Override] = []
     of_all: list[Override] = []
     of_one: list[Override] = []
@@ -153,7 +127,7 @@ def several_tracks(choosing: Sequence[Override], changing: Sequence[Override]) -
         else:
             _check_first(override, first, names)
             of_all += [replace(override, key_or_group=f"{GROUP}.{name}.{key}") for name in names]
-    return SeveralTracks(names, (*others, *of_all, *of_one))
+    return names, [*others, *of_all, *of_one]
 
 
 def _check(line: str, names: Sequence[str], known: Sequence[str]) -> None:
