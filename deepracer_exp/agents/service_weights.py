@@ -14,7 +14,7 @@ import torch
 from tensordict.nn import AddStateIndependentNormalScale
 from torch import nn
 
-from deepracer_exp.aws.logs.files import natural
+from deepracer_exp.aws.archives import natural
 from deepracer_exp.aws.models.model_metadata import CAMERAS, LIDARS
 from deepracer_exp.errors import BadInput
 

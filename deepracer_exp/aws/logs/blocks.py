@@ -1,27 +1,17 @@
 """Large files read in blocks of whole lines."""
 
 import codecs
-import lzma
-import tarfile
-import zipfile
-import zlib
 from collections.abc import Iterator
 from typing import IO
 
+from deepracer_exp.aws.archives import READ_ERRORS, reason_of
 from deepracer_exp.files import LOG_BYTES
 
-READ_ERRORS = (OSError, EOFError, zlib.error, lzma.LZMAError, tarfile.TarError, zipfile.BadZipFile)
-"""Errors of reading a file or a member of an archive."""
 SIZE = 2**23
 """Size of a block in bytes."""
 _PIECE = 2**16
 _LONGEST_LINE = 2**24
 _UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-
-
-def reason_of(error: Exception) -> str:
-    """Return the message of such an error in one line; its type where it has none."""
-    return " ".join(str(error).split()) or type(error).__name__
 
 
 class Blocks:

@@ -8,16 +8,25 @@ import os
 import re
 import stat
 import tarfile
-import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
+from deepracer_exp.aws.archives import (
+    READ_ERRORS,
+    ZIP,
+    Archive,
+    Member,
+    members_of,
+    natural,
+    open_archive,
+    open_member,
+    reason_of,
+)
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import LOG_BYTES, open_user_file
 
-from .blocks import READ_ERRORS, reason_of
 from .recording import LogProblem, readable
 
 _ACCEPTED = "trace CSVs or logs of the service"
@@ -36,8 +45,6 @@ LOG = re.compile(r"(?:\.(?:log|txt|out|err)(?:\.\d{1,4})?|^(?:stdout|stderr))$",
 # The group matches for a single compressed file, not for an archive.
 PACKED = re.compile(r"\.(?:zip|tar|tgz|tbz2?|txz|tar\.(?:gz|bz2|xz)|(gz|bz2|xz))$", re.IGNORECASE)
 _OPEN: Mapping[str, Any] = {"gz": gzip.open, "bz2": bz2.open, "xz": lzma.open}
-_ZIP = (b"PK\x03\x04", b"PK\x05\x06")
-"""How a zip archive begins, one without members as well."""
 _MARKS = {b"\x1f\x8b": "gz", b"BZh": "bz2", b"\xfd7zXZ": "xz"}
 
 
@@ -96,12 +103,6 @@ class Place:
     name: str
     """Name of that training or evaluation."""
     worker: int
-
-
-def natural(text: str) -> tuple[tuple[int, int | str], ...]:
-    """Return a sort key that orders numbers in names by value."""
-    pieces = re.split(r"(\d+)", text)
-    return tuple((1, int(piece)) if piece.isdigit() else (0, piece) for piece in pieces)
 
 
 def named_parts(path: Path) -> tuple[str, ...]:
@@ -231,62 +232,7 @@ def _plain(path: Path, parts: tuple[str, ...]) -> LogFile:
 def _is_packed(path: Path) -> bool:
     with path.open("rb") as file:
         head = file.read(512)
-    return head.startswith((*_MARKS, *_ZIP)) or head[257:262] == b"ustar"
-
-
-_Archive = tarfile.TarFile | zipfile.ZipFile
-
-
-@dataclass(frozen=True)
-class _Member:
-    """A member of an archive."""
-
-    name: str
-    size: int
-    """In bytes, unpacked."""
-    kind: str
-    """`file`, `link` or `other`."""
-    entry: tarfile.TarInfo | zipfile.ZipInfo
-
-    @classmethod
-    def of(cls, entry: tarfile.TarInfo | zipfile.ZipInfo) -> "_Member":
-        """Return the member that an archive lists as an entry."""
-        if isinstance(entry, tarfile.TarInfo):
-            kind = "file" if entry.isfile() else "link" if entry.islnk() or entry.issym() else "other"
-            return cls(entry.name, entry.size, kind, entry)
-        # Only archives made on Unix have a mode.
-        link = stat.S_ISLNK(entry.external_attr >> 16)
-        kind = "other" if entry.is_dir() else "link" if link else "file"
-        return cls(entry.filename, entry.file_size, kind, entry)
-
-
-def _open_archive(path: Path) -> _Archive:
-    with path.open("rb") as file:
-        zipped = file.read(4) in _ZIP
-    return zipfile.ZipFile(path) if zipped else tarfile.open(path, "r:*")
-
-
-def _entries(archive: _Archive) -> Iterator[_Member]:
-    """Yield the members in the order of the archive: going back would mean reading it again."""
-    if isinstance(archive, zipfile.ZipFile):
-        yield from map(_Member.of, archive.infolist())
-        return
-    while (entry := archive.next()) is not None:
-        yield _Member.of(entry)
-
-
-def _stream(archive: _Archive, member: _Member) -> IO[bytes]:
-    if isinstance(archive, tarfile.TarFile):
-        assert isinstance(member.entry, tarfile.TarInfo)
-        stream = archive.extractfile(member.entry)
-        if stream is None:
-            raise OSError(f"{member.name} is not a regular file")
-        return stream
-    assert isinstance(member.entry, zipfile.ZipInfo)
-    try:
-        return archive.open(member.entry)
-    except (RuntimeError, NotImplementedError) as error:  # encrypted, or packed in a way unknown to Python
-        raise OSError(str(error)) from error
+    return head.startswith((*_MARKS, *ZIP)) or head[257:262] == b"ustar"
 
 
 class _Archives:
@@ -294,14 +240,14 @@ class _Archives:
 
     def __init__(self) -> None:
         self._path: Path | None = None
-        self._archive: _Archive | None = None
+        self._archive: Archive | None = None
 
-    def open(self, path: Path, member: "_Member") -> IO[bytes]:
+    def open(self, path: Path, member: Member) -> IO[bytes]:
         """Open a member for reading; a member of another archive must have been read completely."""
         if self._archive is None or self._path != path:
             self.close()
-            self._path, self._archive = path, _open_archive(path)
-        stream = _stream(self._archive, member)
+            self._path, self._archive = path, open_archive(path)
+        stream = open_member(self._archive, member)
         ending = _ending(member.name)
         return stream if ending is None else _OPEN[ending](stream)
 
@@ -327,7 +273,7 @@ def _unpack(
         OSError: it cannot be read, or is neither an archive nor compressed.
     """
     try:
-        with _open_archive(path) as archive:
+        with open_archive(path) as archive:
             members = _members(path, archive, archives)
     except tarfile.ReadError:
         with path.open("rb") as file:
@@ -356,7 +302,7 @@ def _lies_beside(path: Path, file: LogFile) -> bool:
     """Return whether a member of an archive is also unpacked beside it, with the same name and size."""
     named = (PACKED.sub("", path.name),)
     _, member = file.given
-    assert isinstance(member, _Member)
+    assert isinstance(member, Member)
     for place in (file.parts, (*named, *file.parts), (*named, *file.parts[1:])):
         with contextlib.suppress(OSError):  # not there, or a name that no file system takes
             if path.parent.joinpath(*place).stat().st_size == member.size:
@@ -380,12 +326,12 @@ def _ending(name: str) -> str | None:
     return packed[1].lower() if packed is not None and packed[1] else None
 
 
-def _members(path: Path, archive: _Archive, archives: _Archives) -> LogFolder:
+def _members(path: Path, archive: Archive, archives: _Archives) -> LogFolder:
     """List the members."""
     found = LogFolder()
-    members: dict[tuple[str, ...], _Member] = {}
+    members: dict[tuple[str, ...], Member] = {}
     try:
-        for member in _entries(archive):
+        for member in members_of(archive):
             if member.kind == "file":
                 parts = tuple(
                     part for part in PurePosixPath(member.name).parts if part not in ("/", "..", ".")

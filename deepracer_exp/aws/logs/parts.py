@@ -8,14 +8,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import IO, Any
 
+from deepracer_exp.aws.archives import READ_ERRORS, natural, reason_of
 from deepracer_exp.aws.models.hyperparameters import read_hyperparameters
 from deepracer_exp.aws.models.model_metadata import ModelMetadata, read_model_metadata
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import SETTINGS_BYTES, read_yaml
 
 from . import sim_trace
-from .blocks import READ_ERRORS, reason_of
-from .files import LOG, LogFile, LogFolder, Place, natural, place_of
+from .files import LOG, LogFile, LogFolder, Place, place_of
 from .recording import TRAINING, LogProblem
 from .sim_trace import StepTables, read_trace_csv
 from .text_log import MARKER, TrainingLog, piece_of, read_training_logs
@@ -106,8 +106,10 @@ def read_parts(folder: LogFolder) -> Parts:
             known = _read(parts, file, alone)
         except (ValueError, *READ_ERRORS) as error:  # BadInput is a ValueError
             known = False
-            reason = reason_of(error).removeprefix(f"{file.path}: ")
-            parts.problems.append(LogProblem(str(file.path), None, reason))
+            reason = reason_of(error)
+            if isinstance(error, READ_ERRORS):
+                reason = f"cannot be read ({reason})"
+            parts.problems.append(LogProblem(str(file.path), None, reason.removeprefix(f"{file.path}: ")))
         parts.drop_first_steps()
         if known:
             parts.files.append(file)
@@ -221,12 +223,9 @@ def read_metrics_json(stream: IO[bytes]) -> tuple[list[dict[str, Any]], list[str
         `episode_status`, `resets`; and the reasons why other items are none.
 
     Raises:
-        ValueError: it holds no list of metrics, or cannot be read; the message gives the reason.
+        ValueError: it holds no list of metrics; the message gives the reason.
     """
-    try:
-        raw = stream.read(_MOST_METRICS_BYTES + 1)
-    except READ_ERRORS as error:
-        raise ValueError(f"cannot be read ({reason_of(error)})") from error
+    raw = stream.read(_MOST_METRICS_BYTES + 1)
     if len(raw) > _MOST_METRICS_BYTES:
         raise ValueError(f"larger than {_MOST_METRICS_BYTES // 2**20} MiB")
     try:

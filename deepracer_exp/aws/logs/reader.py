@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from deepracer_exp.aws.archives import natural
 from deepracer_exp.errors import BadInput
 
 from .drives import (
@@ -33,7 +34,6 @@ from .files import (
     label,
     log_folder,
     named_parts,
-    natural,
     place_of,
     same_job,
     without_worker,

@@ -8,19 +8,26 @@ import math
 import os
 import re
 import stat
-import tarfile
 import time
-import zipfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import IO, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from deepracer_exp.aws.logs.blocks import READ_ERRORS, reason_of
-from deepracer_exp.aws.logs.files import natural
+from deepracer_exp.aws.archives import (
+    READ_ERRORS,
+    ZIP,
+    Archive,
+    Member,
+    members_of,
+    natural,
+    open_archive,
+    open_member,
+    reason_of,
+)
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import LOG_BYTES, SETTINGS_BYTES
 
@@ -47,10 +54,6 @@ NEWEST = ".coach_checkpoint"
 _ACCEPTED = "a model's folder or archive (.tar.gz, .tar, .zip) with NAME.ckpt.index and its data file, or with model.pb"
 _MOST_FILES = 100_000
 _LOGS = re.compile(r"simtrace/.*\.csv$|\.log$")
-_HEADER_BYTES = 2**20
-"""Most bytes of a long name in an archive."""
-
-
 _EMPTY_GRAPH = field(2, field(4, field(1, 27)))
 """A MetaGraphDef whose graph has no nodes; the service requires the file but does not use it to restore weights."""
 
@@ -121,7 +124,7 @@ def read_model(path: str, checkpoint: str) -> StoredModel:
             return _read(files, checkpoint)
     except BadInput:
         raise
-    except (*READ_ERRORS, zipfile.BadZipFile, ValueError, NotImplementedError, RuntimeError) as error:
+    except (*READ_ERRORS, ValueError) as error:
         reason = getattr(error, "strerror", None) or reason_of(error)
         raise BadInput(f"{path}: cannot be read: {reason}; accepted: {_ACCEPTED}") from error
 
@@ -209,14 +212,10 @@ def _opened(path: str) -> Iterator[_Files]:
         raise BadInput(f"{path}: is larger than {LOG_BYTES // 2**30} GiB; accepted: {_ACCEPTED}")
     with Path(path).open("rb") as file:
         head = file.read(512)
-    if head.startswith(b"PK"):
-        with zipfile.ZipFile(path) as packed:
-            yield _zip(path, packed)
-    elif head.startswith(b"\x1f\x8b") or head[257:262] == b"ustar":
-        with closing(tarfile.open(path, "r:gz" if head[0] == 0x1F else "r:", tarinfo=_Member)) as archive:
-            yield _tar(path, archive)
-    else:
+    if not (head.startswith((*ZIP, b"\x1f\x8b")) or head[257:262] == b"ustar"):
         raise BadInput(f"{path}: is no archive; accepted: {_ACCEPTED}")
+    with open_archive(Path(path)) as archive:
+        yield _packed(path, archive)
 
 
 def _folder(path: str) -> _Files:
@@ -235,49 +234,19 @@ def _folder(path: str) -> _Files:
     return files
 
 
-def _zip(path: str, packed: zipfile.ZipFile) -> _Files:
-    files = _Files(path, packed.open)
-    for member in packed.infolist():
-        if stat.S_ISLNK(member.external_attr >> 16):
-            raise _link(path, member.filename)
-        if not member.is_dir():
-            files.add(member.filename, member.file_size)
-    return files
-
-
-def _tar(path: str, archive: tarfile.TarFile) -> _Files:
-    members: dict[str, tarfile.TarInfo] = {}
-
-    def opened(name: str) -> IO[bytes]:
-        stream = archive.extractfile(members[name])
-        assert stream is not None
-        return stream
-
-    files = _Files(path, opened)
-    while (member := archive.next()) is not None:
-        if member.islnk() or member.issym():
-            raise _link(path, member.name)
-        if member.isfile():
+def _packed(path: str, archive: Archive) -> _Files:
+    """List the files of an archive."""
+    members: dict[str, Member] = {}
+    files = _Files(path, lambda name: open_member(archive, members[name]))
+    for member in members_of(archive):
+        if member.kind == "link":
+            raise BadInput(f"{path}: {member.name}: is a link; accepted: archives of files alone")
+        if member.kind == "other":
+            raise BadInput(f"{path}: {member.name}: is no file; accepted: {_ACCEPTED}")
+        if member.kind == "file":
             files.add(member.name, member.size)
             members[member.name] = member  # the later one counts, as in unpacking
-        elif not member.isdir():
-            raise BadInput(f"{path}: {member.name}: is no file; accepted: {_ACCEPTED}")
     return files
-
-
-def _link(path: str, name: str) -> BadInput:
-    return BadInput(f"{path}: {name}: is a link; accepted: archives of files alone")
-
-
-class _Member(tarfile.TarInfo):
-    """Refuses long names and attributes that tarfile would read into memory whatever their size."""
-
-    def _proc_member(self, archive: tarfile.TarFile) -> Any:
-        if self.type not in tarfile.SUPPORTED_TYPES or (
-            self.type not in tarfile.REGULAR_TYPES and self.size > _HEADER_BYTES
-        ):
-            raise BadInput(f"{archive.name!s}: a header of {self.size:,} bytes; accepted: {_ACCEPTED}")
-        return super()._proc_member(archive)  # type: ignore[misc]
 
 
 def checkpoint_files(tensors: Tensors, number: int, steps: int, progress: float | None) -> dict[str, bytes]:
