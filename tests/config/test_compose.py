@@ -114,8 +114,8 @@ def test_quotes_home_and_environment_variables_are_understood(monkeypatch, tmp_p
         ("algorithm.epoch=1", ["did you mean epochs?"]),
         ("algorithm.learning_rate=1", ["with algorithm=ppo", "known: lr, batch_size"]),
         (
-            "lr_schedule.length=3",
-            ["lr_schedule.length: no such key with lr_schedule=constant", "known: kind, by, warmup"],
+            "lr_schedule.lengths=3",
+            ["lr_schedule.lengths: no such key with lr_schedule=linear", "known: kind, by, warmup"],
         ),
         ("+foo=1", ["foo: no such key"]),
         ("+algorithm.foo=1", ["algorithm.foo: no such key", "known: lr"]),

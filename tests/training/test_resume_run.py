@@ -260,7 +260,7 @@ MORE = "budget.iterations=6"
         (None, [MORE, "algorithm.learning_rate=1"], ["algorithm.learning_rate: no such key"]),
         (None, [MORE, "experiment=fast_lap"], ["experiment=fast_lap", "give the groups and values"]),
         (None, ["budget.iterations=many"], ["budget.iterations"]),
-        (change_config, [MORE], ["algorithm.entropy_coeff: 0.001 -> 0.5"]),
+        (change_config, [MORE], ["algorithm.entropy_coeff: 0.01 -> 0.5"]),
         (lose_a_row, [MORE], ["has 2 of the 3 rows"]),
         (spoil_checkpoints, [MORE], ["is intact"]),
         (RunFolder, [MORE], ["a process is training in it"]),
