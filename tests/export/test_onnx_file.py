@@ -17,7 +17,7 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.env.action_space import ActionSpace, build_action_space
 from deepracer_exp.errors import BadInput, RunFailed
-from deepracer_exp.export import export as exporting
+from deepracer_exp.export import onnx as exporting
 from deepracer_exp.export.onnx import TOLERANCE, DeployedPolicy, largest_difference, write_onnx
 
 FEATURES = tuple(f"feature_{number}" for number in range(19))
