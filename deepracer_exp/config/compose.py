@@ -139,7 +139,7 @@ def compose_entry(entry: str, overrides: Sequence[str], *, stored: bool = False)
             choices[TRACK] = f"[{','.join(names)}]"
         try:
             for override in changing:
-                if not change(config, override):
+                if _is_taken_for_a_group(config, override) or not change(config, override):
                     raise BadInput(_unknown_key(entry, override.key_or_group, config, choices))
             mapping = plain(config)
         except OmegaConfBaseException as error:
@@ -283,6 +283,12 @@ def _dotted(node: Any, prefix: str = "") -> Iterable[str]:
         for key, value in node.items():
             yield f"{prefix}{key}"
             yield from _dotted(value, f"{prefix}{key}.")
+
+
+def _is_taken_for_a_group(config: DictConfig, override: Override) -> bool:
+    """Return whether a word is given for a section of several keys that has no options here."""
+    key = override.key_or_group
+    return "." not in key and isinstance(config.get(key), DictConfig) and isinstance(override.value(), str)
 
 
 def _unknown_key(entry: str, key: str, config: DictConfig, choices: Mapping[str, str]) -> str:

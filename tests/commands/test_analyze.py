@@ -130,7 +130,6 @@ def test_the_lap_whose_line_is_written_is_named_and_can_be_asked_for(run_dir, ca
         (["RUN", "--target", "nan"], ["--target nan", "accepted"]),
         (["RUN", "--reward", "racing_lime"], ["racing_lime"]),
         (["RUN", "--track", "Atlantis"], ["Atlantis"]),
-        (["RUN", "--compare", "other"], ["--compare: write deepracer-exp compare"]),
         (["RUN", "other"], ["2 runs or logs given", "deepracer-exp compare takes several"]),
         (["RUN", "--line", "line.txt"], ["--line line.txt", "accepted", ".csv, .npy, .py"]),
         (["RUN", "--line", "nowhere/line.csv"], ["--line nowhere/line.csv", "accepted"]),

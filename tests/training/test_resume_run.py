@@ -141,6 +141,7 @@ def test_a_run_killed_as_soon_as_it_is_one_begins_again_and_is_recorded_once(tra
     (config,) = killed.wait_for(lambda: list(tmp_path.glob("runs/*/*/config.yaml")), "run")
     killed.popen.kill()
     killed.popen.wait()
+    killed.assert_nothing_left()  # the command's process outlives the one that started it by a moment
     run = config.parent
     assert not (run / "tracking.json").exists()
     ended = call("resume", run.name, "tracking=mlflow")
