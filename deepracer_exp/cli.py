@@ -148,32 +148,32 @@ def supervised(call: Callable[[], int]) -> int:
         call: returns 0 to 255; an exception ends the child with a traceback.
     """
     results, result = os.pipe()
-    heard, hears = os.pipe()
+    signal_read_fd, signal_write_fd = os.pipe()
     supervisor = os.getpid()
     signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     child = os.fork()
     if child == 0:
         os.close(results)
-        os.close(heard)
+        os.close(signal_read_fd)
         die_with_parent()
         if os.getppid() != supervisor:
             os._exit(RunFailed.exit_code)
         # Python writes the number of each signal it receives into this pipe.
-        os.set_blocking(hears, False)
-        signal.set_wakeup_fd(hears, warn_on_full_buffer=False)
+        os.set_blocking(signal_write_fd, False)
+        signal.set_wakeup_fd(signal_write_fd, warn_on_full_buffer=False)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
         code = call()
         os.write(result, bytes([code]))
         return code
     os.close(result)
-    os.close(hears)
+    os.close(signal_write_fd)
 
     interruptions: list[int] = []
 
     def pass_on(signum: int, _: FrameType | None) -> None:
         """Give the child a signal that was sent to this process alone; Ctrl-C in a terminal reaches both."""
         interruptions.append(signum)
-        if not _has_heard(heard, signum):
+        if not _has_received(signal_read_fd, signum):
             with contextlib.suppress(ProcessLookupError):  # it has just ended
                 os.kill(child, signum)
 
@@ -200,10 +200,10 @@ def supervised(call: Callable[[], int]) -> int:
     return RunFailed.exit_code
 
 
-def _has_heard(heard: int, signum: int) -> bool:
+def _has_received(signal_read_fd: int, signum: int) -> bool:
     give_up_at = time.monotonic() + _ARRIVES_S
-    while select.select([heard], [], [], max(give_up_at - time.monotonic(), 0.0))[0]:
-        received = os.read(heard, 65536)
+    while select.select([signal_read_fd], [], [], max(give_up_at - time.monotonic(), 0.0))[0]:
+        received = os.read(signal_read_fd, 65536)
         if signum in received:
             return True
         if not received:  # the child is gone

@@ -54,7 +54,7 @@ class CNNConfig:
     lidar_hidden: Annotated[tuple[Units, ...], Field(min_length=1, max_length=8)] = (32, 32)
     """Units of each hidden layer that sees a LIDAR alone."""
     lidar_joins_after: Annotated[int, Field(ge=0, le=7)] = 0
-    """So many layers of `hidden` see pictures alone."""
+    """Number of `hidden` layers that see only the camera's features; the LIDAR's join after them."""
 
     def __post_init__(self) -> None:
         """Refuse layers that are not complete, and a trunk that has nothing to share."""

@@ -26,7 +26,7 @@ START_AHEAD_M, START_LENGTH_M, START_WIDTH_M = 0.13, 0.0733, 0.914
 START_CHECKS = (2, 8)
 """Light and dark fields of the start line, along and across the road."""
 FIELD_M = 20.0
-"""Of field around a track without walls."""
+"""Width of the field drawn around a track without walls, in metres."""
 
 MATERIALS = (
     "sky",
