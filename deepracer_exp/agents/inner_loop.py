@@ -16,6 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 from torch import Tensor, nn
+from torchrl.modules import MLP
 
 from deepracer_exp.config.learning import AlgorithmConfig
 
@@ -55,17 +56,13 @@ class InnerLoop:
         self.gradients: dict[Tensor, Floats] = {
             parameter: np.zeros(parameter.shape, np.float32) for parameter in networks.parameters()
         }
-        """Of the last gradient step, after clipping."""
+        """Gradients of the last step, after clipping, by parameter."""
 
     @staticmethod
     def fits(networks: ActorCritic) -> bool:
-        """Return whether the networks are perceptrons that share nothing."""
-        return networks.trunk is None and all(
-            isinstance(layers, nn.Sequential)
-            and {type(layer) for layer in layers} <= {nn.Linear, *_ACTIVATIONS}
-            and [type(layer) is nn.Linear for layer in layers] == [n % 2 == 0 for n in range(len(layers))]
-            for layers in (_policy_layers(networks)[0], networks.value_head.module)
-        )
+        """Return whether the networks are perceptrons that share nothing, as `build_actor_critic` makes them."""
+        heads = (_policy_layers(networks)[0], networks.value_head.module)
+        return networks.trunk is None and all(map(_is_plain, heads))
 
     def run(self, columns: Sequence[Tensor], size: int, lr: float, entropy_coeff: float) -> Tensor:
         """Make the gradient steps of an epoch in place.
@@ -121,6 +118,19 @@ class InnerLoop:
             tensors = (parameter.detach(), torch.from_numpy(gradient), own["exp_avg"], own["exp_avg_sq"])
             rows.append(tuple(tensor.view(-1).numpy() for tensor in tensors))
         return tuple(zip(*rows, strict=True)), int(own["step"])
+
+
+def _is_plain(layers: nn.Module) -> bool:
+    """Return whether layers are linear with biases, one kind of activation between them and none at the end."""
+    if type(layers) is not MLP:  # a class of the user's own may compute anything
+        return False
+    linear, activations = list(layers.children())[::2], list(layers.children())[1::2]
+    return (
+        len(linear) == len(activations) + 1
+        and all(type(layer) is nn.Linear and layer.bias is not None for layer in linear)
+        and len({type(layer) for layer in activations}) <= 1
+        and all(type(layer) in _ACTIVATIONS and getattr(layer, "alpha", 1.0) == 1.0 for layer in activations)
+    )
 
 
 def _policy_layers(networks: ActorCritic) -> tuple[nn.Module, nn.Parameter | None]:

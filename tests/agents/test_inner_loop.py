@@ -5,6 +5,8 @@ import math
 
 import pytest
 import torch
+from torch import nn
+from torchrl.modules import MLP
 from torchrl.objectives import ClipPPOLoss
 
 from deepracer_exp.agents.actor_critic import build_actor_critic
@@ -94,6 +96,31 @@ def test_a_step_that_is_not_finite_is_not_made_and_named():
     with pytest.raises(RunFailed, match="the gradient step was not made"):
         ppo._epoch(ppo._inner_loop, steps, torch.arange(64), 64, 1e-3, 0.0)
     assert torch.equal(parameters(networks), before)
+
+
+class Squared(MLP):
+    def forward(self, *inputs):
+        return super().forward(*inputs).square()
+
+
+@pytest.mark.parametrize(
+    "own",
+    [
+        nn.Sequential(nn.Linear(4, 8), nn.ReLU(), nn.Linear(8, 8), nn.Tanh(), nn.Linear(8, 1)),
+        nn.Sequential(nn.Linear(4, 8), nn.ReLU(), nn.Linear(8, 1), nn.Tanh()),
+        Squared(4, 1, num_cells=[8], activation_class=nn.ReLU),
+        MLP(4, 1, num_cells=[8], activation_class=nn.ReLU, activate_last_layer=True),
+        MLP(4, 1, num_cells=[8], activation_class=nn.ELU, activation_kwargs={"alpha": 2.0}),
+        MLP(4, 1, num_cells=[8], activation_class=nn.ReLU, bias_last_layer=False),
+        MLP(4, 1, num_cells=[8], activation_class=nn.GELU),
+    ],
+    ids=["two activations", "no sequence of ours", "forward", "activated end", "alpha", "no bias", "gelu"],
+)
+def test_another_network_is_left_to_autograd(own):
+    networks, _ = make()
+    assert InnerLoop.fits(networks)
+    networks.value_head.module = own
+    assert not InnerLoop.fits(networks)
 
 
 def test_what_it_does_not_fit_is_left_to_autograd():
