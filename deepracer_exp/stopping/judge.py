@@ -34,7 +34,7 @@ PATIENCE_SHARE = 0.2
 POOR = 50.0
 """Completion below which a training that no longer grows has not learned to drive, per cent."""
 LOG_OVERFITTING = OverfittingRule(warmup=0, patience=3, held_out_drop=10.0, return_drop=0.05)
-"""The same for overfitting; such a log has an evaluation after each iteration."""
+"""The rule of overfitting for the logs of others, which have an evaluation after each iteration."""
 _FEWEST_EVALUATIONS = 6
 
 

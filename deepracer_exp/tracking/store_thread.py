@@ -16,9 +16,9 @@ _log = logging.getLogger(__name__)
 UPDATE_S = 3.0
 """Pause between two updates of a store that answers."""
 _LONGEST_PAUSE_S = 10.0
-"""The same while it does not answer: longer and longer up to this."""
+"""Longest pause while the store does not answer; pauses grow until then."""
 _LAST_PAUSE_S = 0.5
-"""The same once there is a deadline."""
+"""Longest pause once the store has a deadline."""
 
 
 class StoreThread:

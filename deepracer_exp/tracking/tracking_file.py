@@ -31,7 +31,7 @@ class TrackedRun:
     store: str = ""
     """Address of the MLflow that records the run, without password."""
     run_id: str | None = None
-    """Its id there; None until it is created."""
+    """MLflow's id of the run; None until MLflow has created it."""
     status: Status | None = None
     """How the run ended; None while it is running, or if it was killed."""
     end_ms: int | None = None
