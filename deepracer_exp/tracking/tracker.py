@@ -1,14 +1,8 @@
 """Trackers: what a training reports about its run, and who records it."""
 
-import importlib.util
 from collections.abc import Mapping
 from pathlib import Path
 
-from deepracer_exp.config.own_class import OwnClass, build_own
-from deepracer_exp.config.running import MLflowTracking, TensorBoardTracking, TrackingConfig, TrackingOff
-from deepracer_exp.errors import BadInput
-
-from .store import resolve_store
 from .tracking_file import Status, TrackedRun
 
 FINISH_S = 30.0
@@ -65,27 +59,3 @@ class Tracker:
 
         A failed or killed run may be resumed from its last checkpoint: later points are not written.
         """
-
-
-def open_tracker(config: TrackingConfig, runs_dir: Path) -> Tracker:
-    """Return the tracker of a config.
-
-    Raises:
-        BadInput: `tracking.uri` can never work, a package is not installed, or a class cannot be used.
-    """
-    # Imported here, because both modules build on this one.
-    from .loggers import TensorBoardTracker, WandbTracker
-    from .mlflow_tracker import MLflowTracker
-
-    if isinstance(config, OwnClass):
-        return build_own(config, "tracking.target", Tracker)
-    if isinstance(config, TrackingOff):
-        return Tracker()
-    if isinstance(config, MLflowTracking):
-        return MLflowTracker(resolve_store(config.uri, runs_dir))
-    if importlib.util.find_spec(config.kind) is None:
-        raise BadInput(
-            f"tracking={config.kind}: needs the package {config.kind}; install the project with its extra: "
-            f"pip install 'deepracer-exp[{config.kind}]'"
-        )
-    return TensorBoardTracker() if isinstance(config, TensorBoardTracking) else WandbTracker(config)

@@ -5,8 +5,8 @@ import pytest
 
 from deepracer_exp.config.running import MLflowTracking
 from deepracer_exp.errors import BadInput
+from deepracer_exp.tracking.build import open_tracker
 from deepracer_exp.tracking.store import resolve_store
-from deepracer_exp.tracking.tracker import open_tracker
 from tests.conftest import refused
 
 SERVERS = "accepted: http(s)://host:port"
@@ -38,7 +38,8 @@ def test_a_path_that_sqlite_uris_cannot_name_is_bad_input(tmp_path):
 
 def test_neither_a_uri_that_is_checked_nor_tracking_off_imports_mlflow(tmp_path):
     code = (
-        "import sys; from pathlib import Path; from deepracer_exp.tracking.tracker import *\n"
+        "import sys; from pathlib import Path; from deepracer_exp.tracking.build import *\n"
+        "from deepracer_exp.tracking.tracking_file import TrackedRun\n"
         "from deepracer_exp.tracking.store import resolve_store\n"
         f"resolve_store(None, Path({str(tmp_path)!r}))\n"
         f"tracker = open_tracker(TrackingOff(kind='off'), Path({str(tmp_path / 'runs')!r}))\n"
