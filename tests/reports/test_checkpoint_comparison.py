@@ -18,8 +18,7 @@ from deepracer_exp.reports.checkpoint_comparison import (
     lap_statistics,
     recommend,
 )
-
-from .test_result import attempt, group
+from tests.evaluation.test_result import attempt, group
 
 
 def figures(

@@ -17,10 +17,9 @@ from deepracer_exp.reports.log_report import SECTIONS, LogPage, write_report
 from deepracer_exp.reports.log_report import html as page_html
 from deepracer_exp.runs.recording import RunRecording
 from deepracer_exp.runs.result import RunResult
+from tests.analysis.made_up import Drive, made_up_recording
 from tests.browser import needs_chromium
 from tests.page_html import Html
-
-from .made_up import Drive, made_up_recording
 
 NASTY = "</script><script>alert(1)</script><img src=x onerror=alert(2)>&'\"{{7*7}}"
 

@@ -17,8 +17,7 @@ from deepracer_exp.reports.against_log import (
     lines_compared,
     logged_laps,
 )
-
-from .made_up import Drive, made_up_course, made_up_recording
+from tests.analysis.made_up import Drive, made_up_course, made_up_recording
 
 
 def compared(logged: list[Drive], simulated: list[Drive]) -> AgainstLog:

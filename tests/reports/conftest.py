@@ -1,0 +1,1 @@
+from tests.evaluation.conftest import circle, driver, experiment, protocol, run_dir  # noqa: F401 - fixtures
