@@ -13,6 +13,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
+from deepracer_exp.tracks.outline import rings_of
 from deepracer_exp.tracks.track import Track
 
 LINE_WIDTH_M = 0.0762
@@ -93,7 +94,7 @@ def build_scenery(track: Track) -> Scenery:
     ring = wall_ring(track)
     if ring is None:
         low_x, low_y, high_x, high_y = road.bounds
-        (field,) = _rings(shapely.box(low_x - FIELD_M, low_y - FIELD_M, high_x + FIELD_M, high_y + FIELD_M))
+        (field,) = rings_of(shapely.box(low_x - FIELD_M, low_y - FIELD_M, high_x + FIELD_M, high_y + FIELD_M))
         drawing.add(([field], FIELD, SKY))
     else:
         for (ax, ay), (bx, by) in pairwise(ring):
@@ -107,7 +108,7 @@ def build_scenery(track: Track) -> Scenery:
         borders = [shapely.LineString(line).buffer(LINE_WIDTH_M) for line in (track.inner, track.outer)]
         plain = road.difference(shapely.union_all(borders))
     for area, inside, outside in ((paved_area(track), LINE, FIELD), (plain, ROAD, LINE)):
-        for ring in _rings(area):
+        for ring in rings_of(area):
             for first in range(0, len(ring) - 1, _PIECE_LINES):
                 some = ring[first : first + _PIECE_LINES + 1]
                 coarse = shapely.get_coordinates(shapely.LineString(some).simplify(COARSE_M))
@@ -118,11 +119,11 @@ def build_scenery(track: Track) -> Scenery:
     runs = [dashes]
     if floor.start_line_color is not None:
         start, dark = _start_line(center, plain)
-        rings = list(_rings(start))
+        rings = rings_of(start)
         if rings:  # not on a road that is narrower than its lines
             drawing.add_levels(
                 CURVES_UNTIL_M,
-                [(rings, LINE, ROAD), (list(_rings(dark)), START, LINE)],
+                [(rings, LINE, ROAD), (rings_of(dark), START, LINE)],
                 [(rings, FAR_START, ROAD)],
             )
         seen = groupby(dashes, lambda dash: not start.intersects(shapely.Polygon(dash)))
@@ -130,7 +131,7 @@ def build_scenery(track: Track) -> Scenery:
     for run in runs:
         drawing.add_dashes(run, DASH, FAR_DASH, ROAD)
     if floor.kerb_color is not None:
-        for ring in _rings(paved_area(track, KERB_WIDTH_M / 2)):
+        for ring in rings_of(paved_area(track, KERB_WIDTH_M / 2)):
             stripes = list(_dashes(ring, KERB_WIDTH_M, KERB_LENGTH_M, KERB_GAP_M))
             drawing.add_dashes(stripes, KERB, FAR_KERB, LINE)
     return drawing.finish()
@@ -148,7 +149,7 @@ def wall_ring(track: Track) -> NDArray[np.float64] | None:
         if track.floor.walls_follow_road
         else shapely.box(low_x - beyond, low_y - beyond, high_x + beyond, high_y + beyond)
     )
-    (ring,) = _rings(around)
+    (ring,) = rings_of(around)
     return ring
 
 
@@ -251,14 +252,6 @@ class _Drawing:
             np.array(self._pieces, PIECE),
             np.array([0, len(self._pieces)]),
         )
-
-
-def _rings(area: BaseGeometry) -> Iterator[NDArray[np.float64]]:
-    """Yield the outlines of an area, which has them on its left."""
-    for polygon in shapely.get_parts(area):
-        if isinstance(polygon, shapely.Polygon) and not polygon.is_empty:
-            for ring in shapely.get_rings(shapely.orient_polygons(polygon)):
-                yield shapely.get_coordinates(ring)
 
 
 def _dashes(

@@ -1,6 +1,8 @@
 """Pictures of a course: braille for the terminal, or an image file."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -8,10 +10,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch, Polygon
-from matplotlib.path import Path as Outline
-from shapely import get_coordinates, get_parts, get_rings, orient_polygons
-from shapely.geometry.base import BaseGeometry
+from matplotlib.path import Path as RingPath
 
+from .outline import Outline, Points
 from .track import Track
 
 DOT_BITS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]])
@@ -43,7 +44,8 @@ def draw_terminal(track: Track, columns: int, rows: int) -> str:
     Returns:
         Lines without trailing blanks, joined by newlines.
     """
-    low, high = _extent(track)
+    outline = Outline.of(track)
+    low, high = outline.corners()
     # A character is about twice as high as wide, so that braille dots are square.
     dots = np.array([2 * columns, 4 * rows])
     scale = float(((dots - 1) / np.maximum(high - low, 1e-9)).min())
@@ -55,9 +57,9 @@ def draw_terminal(track: Track, columns: int, rows: int) -> str:
 
     width, height = dot(np.array([[high[0], low[1]]]))[0] + 1
     image = np.zeros((-(-height // 4) * 4, -(-width // 2) * 2), bool)
-    lines = [track.inner, track.outer, np.stack([track.inner[0], track.outer[0]])]
+    lines = [*outline.borders, outline.start_line]
     if not track.closed:
-        lines.append(np.stack([track.inner[-1], track.outer[-1]]))
+        lines.append(np.stack([border[-1] for border in outline.borders]))
     for line in lines:
         x, y = dot(_dense(line, 0.5 / scale)).T
         image[y, x] = True
@@ -83,9 +85,9 @@ def draw_picture(track: Track, path: str | Path, driven: np.ndarray | None = Non
         path: To write.
         driven: A lap to draw on it, x and y in m and speed in m/s, (n, 3), coloured by its speed; None: none.
     """
-    low, high = _extent(track)
-    margin_m = MARGIN * (high - low).max()
-    low, high = low - margin_m, high + margin_m
+    outline = Outline.of(track)
+    low, high = outline.corners()
+    low, high = outline.corners(MARGIN * (high - low).max())
     width_in, height_in = LONG_IN * (high - low) / (high - low).max()
     points_per_m = 72 * LONG_IN / (high - low).max()
     page_in = np.array([max(width_in, NARROW_IN), height_in + HEAD_IN])
@@ -97,9 +99,9 @@ def draw_picture(track: Track, path: str | Path, driven: np.ndarray | None = Non
 
     line = track.floor.line_color
     border_pt = float(np.clip(0.035 * points_per_m, 1.2, 4.0))
-    axes.add_patch(PathPatch(outline(track.road), facecolor=track.floor.road_color, edgecolor="none"))
-    for side in (track.inner, track.outer):
-        axes.plot(*side.T, color=line, linewidth=border_pt, solid_joinstyle="round")
+    axes.add_patch(area_patch(outline.rings, facecolor=track.floor.road_color, edgecolor="none"))
+    for border in outline.borders:
+        axes.plot(*border.T, color=line, linewidth=border_pt, solid_joinstyle="round")
     axes.plot(
         *track.waypoints.T, color=CENTER_COLOR, linewidth=0.7 * border_pt, dashes=(5, 4), dash_capstyle="butt"
     )
@@ -113,9 +115,9 @@ def draw_picture(track: Track, path: str | Path, driven: np.ndarray | None = Non
     tenth = np.arange(0, len(track.waypoints) - track.closed, 10)
     dots_x, dots_y = track.waypoints[tenth[1:]].T  # the first lies on the start line
     axes.scatter(dots_x, dots_y, s=(2.2 * border_pt) ** 2, color=line, zorder=4)
-    border = _roomier_border(track)[tenth]
-    aside = border - track.waypoints[tenth]
-    labels = border + LABEL_PT / points_per_m * aside / np.linalg.norm(aside, axis=1, keepdims=True).clip(
+    beside = _roomier_border(track)[tenth]
+    aside = beside - track.waypoints[tenth]
+    labels = beside + LABEL_PT / points_per_m * aside / np.linalg.norm(aside, axis=1, keepdims=True).clip(
         1e-9
     )
     for index, (x, y) in zip(tenth, labels, strict=True):
@@ -156,11 +158,6 @@ def _facts(track: Track) -> str:
     return f"{track.length_m:.2f} m long, {width}, {direction}{', reversed' if track.reversed else ''}"
 
 
-def _extent(track: Track) -> tuple[np.ndarray, np.ndarray]:
-    points = np.concatenate([track.inner, track.outer])
-    return points.min(axis=0), points.max(axis=0)
-
-
 def _dense(line: np.ndarray, step_m: float) -> np.ndarray:
     """Return points at most `step_m` apart along a polyline."""
     start_m = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))]
@@ -168,11 +165,9 @@ def _dense(line: np.ndarray, step_m: float) -> np.ndarray:
     return np.column_stack([np.interp(at, start_m, line[:, k]) for k in (0, 1)])
 
 
-def outline(area: BaseGeometry) -> Outline:
-    """Return an area's rings as one path; rings run in opposite directions, so holes stay empty."""
-    polygons = [orient_polygons(part) for part in get_parts(area) if part.geom_type == "Polygon"]
-    rings = [get_coordinates(ring) for polygon in polygons for ring in get_rings(polygon)]
-    return Outline.make_compound_path(*(Outline(ring, closed=True) for ring in rings))
+def area_patch(rings: Sequence[Points], **style: Any) -> PathPatch:
+    """Return an area as a patch of matplotlib."""
+    return PathPatch(RingPath.make_compound_path(*(RingPath(ring, closed=True) for ring in rings)), **style)
 
 
 def _start_line(track: Track) -> np.ndarray:

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
-from shapely import get_coordinates, get_parts
 
+from .outline import Outline
 from .track import Track
 
 _FINER = 2
@@ -15,13 +15,13 @@ _DASH_COLOR = "#f5a623"
 
 def extent(track: Track) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the lowest and the highest x and y that a view from above shows, (2,) each."""
-    points = np.concatenate([track.inner, track.outer])
-    return points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M
+    return Outline.of(track).corners(_MARGIN_M)
 
 
 def draw_track(track: Track, pixels_per_m: float) -> Image.Image:
     """Draw the `extent` of a track from above, x to the right and y up."""
-    (low, high), scale = extent(track), _FINER * pixels_per_m
+    outline, scale = Outline.of(track), _FINER * pixels_per_m
+    low, high = outline.corners(_MARGIN_M)
     width, height = (int(size) for size in np.ceil((high - low) * scale))
     image = Image.new("RGB", (width, height), track.floor.ground_color)
     draw = ImageDraw.Draw(image)
@@ -30,16 +30,16 @@ def draw_track(track: Track, pixels_per_m: float) -> Image.Image:
         at = (points - low) * scale
         return [(x, height - y) for x, y in at.tolist()]
 
-    for part in get_parts(track.road):
-        draw.polygon(pixels(get_coordinates(part.exterior)), fill=track.floor.road_color)
-        for hole in part.interiors:
-            draw.polygon(pixels(get_coordinates(hole)), fill=track.floor.ground_color)
+    for around, *holes in outline.polygons:
+        draw.polygon(pixels(around), fill=track.floor.road_color)
+        for hole in holes:
+            draw.polygon(pixels(hole), fill=track.floor.ground_color)
     for at_m in np.arange(0.0, track.length_m - _DASH_M, 2 * _DASH_M):
         ends = track.points_at(np.array([at_m, at_m + _DASH_M]) / track.length_m)
         draw.line(pixels(ends), fill=_DASH_COLOR, width=max(1, round(_DASH_WIDTH_M * scale)))
-    border = max(2, round(_BORDER_M * scale))
-    for side in (track.inner, track.outer):
-        draw.line(pixels(side), fill=track.floor.line_color, width=border, joint="curve")
-    draw.line(pixels(np.stack([track.inner[0], track.outer[0]])), fill="#ffffff", width=2 * border)
+    width = max(2, round(_BORDER_M * scale))
+    for border in outline.borders:
+        draw.line(pixels(border), fill=track.floor.line_color, width=width, joint="curve")
+    draw.line(pixels(outline.start_line), fill="#ffffff", width=2 * width)
     # Drawn at a higher resolution and reduced, for smooth edges.
     return image.reduce(_FINER)

@@ -11,15 +11,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize, TwoSlopeNorm
 from matplotlib.figure import Figure
-from matplotlib.patches import PathPatch
 from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike, NDArray
 
 from deepracer_exp.env.action_space import DiscreteActions
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import BadInput, writing
-from deepracer_exp.tracks.drawing import outline
-from deepracer_exp.tracks.track import Track
+from deepracer_exp.tracks.drawing import area_patch
+from deepracer_exp.tracks.outline import Outline, rings_of
 
 from .probe import Probe
 from .situations import OFF_ROAD_M, middle_speed_mps, poses, sample, situations
@@ -107,7 +106,7 @@ def sample_reward_grid(setup: RaceSetup, state: State, detail: float) -> RewardG
     by_command, _ = rewards(ndist[:, None, None], 0.0, 0.0, all_speeds_mps[:, None], steerings_deg)
 
     track = setup.track
-    (left, lower), (right, upper) = map_corners(track)
+    (left, lower), (right, upper) = Outline.of(track).corners(BESIDE_M + 0.1)
     cell_m = float(np.sqrt(track.road.buffer(BESIDE_M).area / (_PIXELS * detail**2)))
     x, y = (np.arange(a, b, cell_m) + cell_m / 2 for a, b in ((left, right), (lower, upper)))
     grid_x, grid_y = np.meshgrid(x, y)
@@ -128,12 +127,6 @@ def sample_reward_grid(setup: RaceSetup, state: State, detail: float) -> RewardG
         pixels=pixels,
         extent=(x[0] - half_m, x[-1] + half_m, y[0] - half_m, y[-1] + half_m),
     )
-
-
-def map_corners(track: Track) -> tuple[Floats, Floats]:
-    """Return the lower left and the upper right corner of the map, m."""
-    borders = np.concatenate([track.inner, track.outer])
-    return borders.min(axis=0) - BESIDE_M - 0.1, borders.max(axis=0) + BESIDE_M + 0.1
 
 
 def state_of(setup: RaceSetup, probe: Probe, n: int = 40) -> State:
@@ -162,7 +155,7 @@ def draw_reward_map(setup: RaceSetup, of: RewardGrid, state: State, path: Path) 
         BadInput: the picture cannot be written.
     """
     track = setup.track
-    low, high = map_corners(track)
+    low, high = Outline.of(track).corners(BESIDE_M + 0.1)
     colors, norm, extend = _scale(of)
 
     width_in, foot_in, head_in = 12.0, 3.9, 1.0
@@ -182,7 +175,8 @@ def draw_reward_map(setup: RaceSetup, of: RewardGrid, state: State, path: Path) 
         interpolation="bilinear",
         zorder=1,
     )
-    image.set_clip_path(PathPatch(outline(track.road.buffer(BESIDE_M)), transform=main.transData))
+    around = rings_of(track.road.buffer(BESIDE_M))
+    image.set_clip_path(area_patch(around, transform=main.transData))
     _draw_course(main, setup)
 
     bar = figure.colorbar(
@@ -234,15 +228,13 @@ def _known(*rewards: np.ndarray) -> np.ndarray:
 
 
 def _draw_course(axes: Axes, setup: RaceSetup) -> None:
-    track = setup.track
-    for border in (track.inner, track.outer):
+    track, outline = setup.track, Outline.of(setup.track)
+    for border in outline.borders:
         axes.plot(*border.T, color=GROUND, linewidth=3.6, solid_joinstyle="round", zorder=2)
         axes.plot(*border.T, color=INK, linewidth=1.4, solid_joinstyle="round", zorder=3)
     axes.plot(*track.waypoints.T, color=INK, linewidth=0.8, dashes=(6, 6), alpha=0.6, zorder=3)
     halo = [withStroke(linewidth=5.5, foreground=GROUND)]
-    axes.plot(
-        *np.stack([track.inner[0], track.outer[0]]).T, color=INK, linewidth=3.0, zorder=4, path_effects=halo
-    )
+    axes.plot(*outline.start_line.T, color=INK, linewidth=3.0, zorder=4, path_effects=halo)
     # An arrow ahead of the start line shows the driving direction.
     pose = track.start_pose(np.array([0.35, 0.9]) / track.length_m)
     tail, head = zip(pose.x.tolist(), pose.y.tolist(), strict=True)

@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 import plotly.graph_objects as go
 from numpy.typing import ArrayLike, NDArray
-from shapely import get_coordinates, get_parts, get_rings
 
 from deepracer_exp.analysis.statistics import Values, means
+from deepracer_exp.tracks.outline import Outline
 from deepracer_exp.tracks.track import Track
 
 from .figure import Layer, Panel, colored_points, heatmap, line, note
@@ -41,8 +41,7 @@ class Grid:
     @classmethod
     def over(cls, course: Track, most: int) -> "Grid":
         """Lay cells over a course, at most `most`, as small as `_SIDES_M` allows."""
-        borders = np.concatenate([course.inner, course.outer])
-        low, high = borders.min(axis=0) - _RIM_M, borders.max(axis=0) + _RIM_M
+        low, high = Outline.of(course).corners(_RIM_M)
         for side_m in (*_SIDES_M, float((high - low).max() / most**0.5)):
             columns, rows = (int(np.ceil(length / side_m)) for length in high - low)
             if columns * rows <= most or side_m > _SIDES_M[-1]:
@@ -76,12 +75,12 @@ class Grid:
 
 def map_panel(course: Track, layers: Sequence[Layer], title: str = "", numbers: bool = True) -> Panel:
     """Return a map: the road, `layers` on it, its borders above them, and numbers of waypoints beside it."""
-    rings = [get_coordinates(ring) for ring in get_rings(get_parts(course.road))]
-    borders = [line(ring[:, 0], ring[:, 1], FAINT, width=1.0) for ring in rings]
-    ends = np.stack([course.inner[0], course.outer[0]])
-    start = line(ends[:, 0], ends[:, 1], FAINT, width=3.0)
+    outline = Outline.of(course)
+    borders = [line(ring[:, 0], ring[:, 1], FAINT, width=1.0) for ring in outline.rings]
+    x, y = outline.start_line.T
+    start = line(x, y, FAINT, width=3.0)
     notes = _waypoint_numbers(course) if numbers else []
-    shown = [*_road(rings, course.waypoints), *layers, *borders, start, *notes]
+    shown = [*_road(outline.rings, course.waypoints), *layers, *borders, start, *notes]
     x_range, y_range = _extent(shown)
     return Panel(layers=shown, title=title, map=True, x_range=x_range, y_range=y_range)
 
@@ -115,10 +114,10 @@ def beside(course: Track, place: Values, offset_m: Values) -> Values:
 def _road(rings: Sequence[Values], center: Values) -> list[go.layout.Shape]:
     """Return the road and its centre line as shapes, because traces are drawn above every heat map."""
     common = {"type": "path", "xref": "x", "yref": "y", "layer": "below"}
-    outline = "".join(_path(ring) + "Z" for ring in rings)
+    area = "".join(_path(ring) + "Z" for ring in rings)
     edge, dashes = {"color": ROAD_EDGE, "width": 1.4}, {"color": ROAD_CENTER, "width": 1, "dash": "dash"}
     return [
-        go.layout.Shape(path=outline, fillcolor=ROAD_FILL, fillrule="evenodd", line=edge, **common),
+        go.layout.Shape(path=area, fillcolor=ROAD_FILL, fillrule="evenodd", line=edge, **common),
         go.layout.Shape(path=_path(center), line=dashes, **common),
     ]
 

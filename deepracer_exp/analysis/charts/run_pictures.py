@@ -12,12 +12,12 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from matplotlib.patches import PathPatch
 from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import NDArray
 
 from deepracer_exp.env.rules import lap_clock_s
-from deepracer_exp.tracks.drawing import outline
+from deepracer_exp.tracks.drawing import area_patch
+from deepracer_exp.tracks.outline import Outline
 from deepracer_exp.tracks.track import Track
 
 LINE_COLUMNS = (
@@ -31,6 +31,8 @@ SPEED = LinearSegmentedColormap.from_list("speed", ["#e0457b", "#f58f3c", "#ffe1
 BLUE, ORANGE, GREEN, PURPLE = "#2f6fb5", "#d9822b", "#2e8b57", "#7a5195"
 MANY = [*matplotlib.color_sequences["tab20"][::2], *matplotlib.color_sequences["tab20"][1::2]]
 """Colours of the tracks of a run."""
+_MARGIN_M = 0.25
+"""Ground shown around the road."""
 _LAYOUT = ConstrainedLayoutEngine(w_pad=0.15, h_pad=0.12)
 
 
@@ -101,8 +103,9 @@ def lines_figure(shown: Sequence[TrackLines]) -> Figure:
     rows = math.ceil(len(shown) / columns)
     shape = 0.8
     if one:
-        ((left, right), (bottom, top)) = _bounds(shown[0].track)
-        shape = float(np.clip((top - bottom) / (right - left), 0.25, 0.9))
+        low, high = Outline.of(shown[0].track).corners(_MARGIN_M)
+        width_m, height_m = high - low
+        shape = float(np.clip(height_m / width_m, 0.25, 0.9))
     cell = (10.0 if one else 13.0) / columns  # inches
     figure = Figure((columns * cell, rows * (0.9 * shape * cell + 0.9)), dpi=150, layout=_LAYOUT)
     cells = figure.subplots(rows, columns, squeeze=False)
@@ -227,19 +230,13 @@ def _draw_line(axes: Axes, rows: NDArray[np.float64], width: float, arrow: float
     return line
 
 
-def _bounds(track: Track) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the ranges of x and y that show the whole road."""
-    borders = np.concatenate([track.inner, track.outer])
-    (left, bottom), (right, top) = borders.min(axis=0) - 0.25, borders.max(axis=0) + 0.25
-    return (left, right), (bottom, top)
-
-
 def _draw_road(axes: Axes, track: Track) -> None:
-    x_range, y_range = _bounds(track)
+    outline = Outline.of(track)
+    x_range, y_range = np.transpose(outline.corners(_MARGIN_M))
     axes.set(xlim=x_range, ylim=y_range, aspect="equal", anchor="NW")
     axes.set_axis_off()
-    axes.add_patch(PathPatch(outline(track.road), facecolor=ROAD, edgecolor="none", zorder=1))
-    for border in (track.inner, track.outer):
+    axes.add_patch(area_patch(outline.rings, facecolor=ROAD, edgecolor="none", zorder=1))
+    for border in outline.borders:
         axes.plot(*border.T, color=BORDER, linewidth=1.8, solid_joinstyle="round", zorder=2)
     axes.plot(*track.waypoints.T, color=CENTER, linewidth=1.0, dashes=(5, 4), zorder=2)
-    axes.plot(*np.stack([track.inner[0], track.outer[0]]).T, color="white", linewidth=2.2, zorder=3)
+    axes.plot(*outline.start_line.T, color="white", linewidth=2.2, zorder=3)
