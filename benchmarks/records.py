@@ -1,25 +1,27 @@
-"""What `experiment=fast_lap` drives after a few minutes, beside the fastest lap of its car and official records.
+"""What `experiment=fast_lap` drives at its end, beside the fastest lap of its car and official records.
 
-    python -m benchmarks.records [--seeds 5] [--minutes 10] [--tracks A,B,...] [--runs-dir DIR] [--json FILE]
+    python -m benchmarks.records [--seeds 5] [--tracks A,B,...] [--steps N] [--jobs 2] [--runs-dir DIR] [--json FILE]
                                  [OVERRIDE...]
 
-For each track and seed, `deepracer-exp train experiment=fast_lap` trains for so many minutes on this machine, one
-training at a time, and its best checkpoint drives 64 fresh laps from starts all around the track, under usual
+For each track and seed, `deepracer-exp train experiment=fast_lap` trains for the recipe's own budget, or `--steps`,
+as `benchmarks.longer` does, and its best checkpoint drives 64 fresh laps from starts all around the track, under usual
 conditions. The lap of a seed is the mean of its complete laps, from standstill, by the service's clock. Beside it
 stands the fastest lap of the car within the recipe's limits, from standstill at the start line, and its bound from
 below (`deepracer-exp tracks NAME --fastest`). Tracks with official boards of time trials since March 2020 are trained
 again with the car of their newest board.
 
 JSON has, in `tracks` and `official`, for each track `bound_s`, `fastest_s`, `fastest_over_bound`, the `laps_s` of the
-seeds (null: none complete), their `median_s` and `best_s`, `median_over_fastest`, and `completion`, the mean share of
-complete laps; official ones `car` and `record_s` as well. `--runs-dir DIR` leaves the runs in DIR and takes those that
-it finds finished there: an interrupted benchmark continues.
+seeds (null: none complete), their `median_s` and `best_s`, `median_over_fastest`, `completion`, the mean share of
+complete laps, and `train_s`, the longest of the trainings; official ones `car` and `record_s` as well.
+`--runs-dir DIR` leaves the runs in DIR and takes those that it, or `benchmarks.longer`, finished there: an interrupted
+benchmark continues.
 """
 
 import argparse
 import sys
 import tempfile
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +32,12 @@ from deepracer_exp.fastest.lap import Question, fastest_lap
 from deepracer_exp.tracks.boards import boards_of
 
 from .all_tracks import TRACKS
-from .command import trained
+from .command import at_once, read_summary, trained
 from .fresh import Driven, drive
+from .longer import training_overrides
 from .report import benchmark_parser, median, number, percent, table, with_exit_code, write_json
 
-_ALWAYS = ("experiment=fast_lap", "tracking=off", "report=false", "budget.env_steps=null")
+_RECIPE = "fast_lap"
 
 
 def figures(bound_s: float, fastest_s: float, driven: Sequence[Driven]) -> dict[str, Any]:
@@ -55,32 +58,56 @@ def figures(bound_s: float, fastest_s: float, driven: Sequence[Driven]) -> dict[
     }
 
 
-def measure(track: str, car: Sequence[str], options: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    """Search for the fastest lap, train each seed and let it drive."""
-    words = [f"track={track}", *_ALWAYS, f"budget.minutes={options.minutes}", *car, *options.overrides]
-    experiment, _ = compose_experiment(words)
-    (course,) = build_courses(experiment)
-    fastest = fastest_lap(Question.of(experiment, course.tracks[0]))
-    name = "-".join([track, *(word.partition("=")[2] for word in car)])
-    runs = [
-        trained(folder / f"{name}-{seed}", [*words, f"seed={seed}"]).resolve()
-        for seed in range(options.seeds)
+def measure(
+    places: Sequence[tuple[str, str | None]], options: argparse.Namespace, folder: Path
+) -> list[dict[str, Any]]:
+    """Train each track and car over all seeds, search for its fastest lap and let the policies drive.
+
+    Args:
+        places: track, and the car that replaces the recipe's own; None: its own.
+    """
+    overrides = [
+        training_overrides(
+            track, _RECIPE, options.steps, [*([] if car is None else [f"car={car}"]), *options.overrides]
+        )
+        for track, car in places
     ]
-    return figures(fastest.bound_s, fastest.lap_time_s, [drive(run, [None])[0] for run in runs])
+    # All of them before the first training: one that cannot be composed costs nothing.
+    experiments = [compose_experiment(words)[0] for words in overrides]
+    names = ["-".join([track, _RECIPE, *([] if car is None else [car])]) for track, car in places]
+    runs = at_once(
+        options.jobs,
+        [
+            partial(trained, folder / f"{name}-{seed}", [*words, f"seed={seed}"])
+            for name, words in zip(names, overrides, strict=True)
+            for seed in range(options.seeds)
+        ],
+    )
+    rows = []
+    for index, (name, experiment) in enumerate(zip(names, experiments, strict=True)):
+        (course,) = build_courses(experiment)
+        fastest = fastest_lap(Question.of(experiment, course.tracks[0]))
+        of_track = [run.resolve() for run in runs[index * options.seeds : (index + 1) * options.seeds]]
+        driven = [drive(run, [None])[0] for run in of_track]
+        train_s = max(read_summary(run)["wall_clock_s"] for run in of_track)
+        rows.append({**figures(fastest.bound_s, fastest.lap_time_s, driven), "train_s": round(train_s, 1)})
+        print(f"{name}: {rows[-1]}", flush=True)
+    return rows
 
 
 def benchmark(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Measure all tracks, then those with an official board again with the car of its era."""
     tracks = options.tracks.split(",")
-    found: dict[str, Any] = {"tracks": {track: measure(track, (), options, folder) for track in tracks}}
+    found: dict[str, Any] = {
+        "tracks": dict(
+            zip(tracks, measure([(track, None) for track in tracks], options, folder), strict=True)
+        )
+    }
     newest = {track: boards_of(track)[-1] for track in tracks if boards_of(track)}
+    official = measure([(track, board.car) for track, board in newest.items()], options, folder)
     found["official"] = {
-        track: {
-            **measure(track, (f"car={board.car}",), options, folder),
-            "car": board.car,
-            "record_s": board.record_s,
-        }
-        for track, board in newest.items()
+        track: {**row, "car": board.car, "record_s": board.record_s}
+        for (track, board), row in zip(newest.items(), official, strict=True)
     }
     over = [row["fastest_over_bound"] for row in found["tracks"].values()]
     found["mean_fastest_over_bound"] = round(sum(over) / len(over), 4)
@@ -91,7 +118,7 @@ def show(rows: dict[str, dict[str, Any]]) -> str:
     """Return the figures of tracks as a table."""
     head = (
         *("track", "bound (s)", "fastest (s)", "above it", "median lap (s)", "above fastest", "best lap (s)"),
-        *("complete", "record (s)"),
+        *("complete", "training (s)", "record (s)"),
     )
     return table(
         head,
@@ -105,6 +132,7 @@ def show(rows: dict[str, dict[str, Any]]) -> str:
                 percent(row["median_over_fastest"], 1),
                 number(row["best_s"], 2),
                 percent(row["completion"]),
+                number(row["train_s"], 0),
                 number(row.get("record_s"), 2),
             )
             for name, row in rows.items()
@@ -117,14 +145,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, print and store."""
     parser = benchmark_parser("records", __doc__)
     parser.add_argument("--seeds", type=int, default=5, help="trainings on each track (5)")
-    parser.add_argument("--minutes", type=float, default=10.0, help="of each training (10)")
+    parser.add_argument(
+        "--steps", type=int, help="control steps of each training (default: the recipe's budget)"
+    )
+    parser.add_argument("--jobs", type=int, default=2, help="trainings at once")
     parser.add_argument(
         "--tracks", default=",".join(TRACKS), help="A,B,... (the 18 of benchmarks.all_tracks)"
     )
     parser.add_argument("--runs-dir", type=Path, help="folder of the runs; left out: they are not kept")
     options = parser.parse_args(arguments)
-    if options.seeds < 1 or not options.minutes > 0:
-        raise BadInput("--seeds and --minutes: accepted: above 0")
+    if options.seeds < 1 or options.jobs < 1:
+        raise BadInput("--seeds and --jobs: accepted: 1 or more")
     with tempfile.TemporaryDirectory() as temporary:
         found = benchmark(options, options.runs_dir or Path(temporary))
     print(show(found["tracks"]))

@@ -34,7 +34,7 @@ def test_laps_stand_beside_the_fastest_lap_its_bound_and_the_record(tmp_path, mo
     monkeypatch.setattr(
         records, "boards_of", lambda _: (board, replace(board, date="2022-01-01", record_s=3.0))
     )
-    asked = ["--seeds", "1", "--minutes", "0.05", "--tracks", "Straight_track"]
+    asked = ["--seeds", "1", "--steps", "32768", "--tracks", "Straight_track"]
     assert records.main([*asked, "--json", str(tmp_path / "records.json")]) == 0
     found = json.loads((tmp_path / "records.json").read_text())
     own, official = found["tracks"]["Straight_track"], found["official"]["Straight_track"]
@@ -44,6 +44,6 @@ def test_laps_stand_beside_the_fastest_lap_its_bound_and_the_record(tmp_path, mo
     assert "Straight_track" in capsys.readouterr().out
 
 
-def test_no_time_is_refused(capsys):
-    assert records.main(["--minutes", "0"]) == 2
-    assert "--minutes" in capsys.readouterr().err
+def test_no_seed_is_refused(capsys):
+    assert records.main(["--seeds", "0"]) == 2
+    assert "--seeds" in capsys.readouterr().err
