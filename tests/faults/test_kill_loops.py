@@ -67,8 +67,15 @@ def rest(start, cwd):
     assert_every_trial_is_accounted_for_once(cwd, trials=begun)
 
 
+def is_alive(process):
+    try:
+        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:  # it ended between the two questions
+        return False
+
+
 def alive(processes):
-    return [one for one in processes if one.is_running() and one.status() != psutil.STATUS_ZOMBIE]
+    return list(filter(is_alive, processes))
 
 
 def test_nothing_outlives_a_killed_driver_and_its_study_resumes(start, tmp_path, kill):
