@@ -15,12 +15,33 @@ NO_MEMORY = "needs more memory than there is"
 
 
 class BadInput(ValueError):  # noqa: N818 - reads as what it is at the raise site
-    """Something the user gave cannot be used; the message is one line that says what would be accepted."""
+    """Something the user gave cannot be used; its line is ``what: why; accepted: accepted``.
+
+    Attributes:
+        what: the file, key or value; None where `why` is a sentence that names it.
+        why: the reason.
+        accepted: what would be accepted; empty where the reason says it.
+    """
 
     exit_code = 2
 
-    def __init__(self, message: object) -> None:
-        super().__init__(_one_line(str(message)))
+    def __init__(self, what: object, why: object = None, accepted: object = "") -> None:
+        """Take the parts of the line, or `what` alone: a sentence that says all of it."""
+        self.what = None if why is None else str(what)
+        self.why = str(what if why is None else why)
+        self.accepted = str(accepted)
+        super().__init__(_one_line(self._reason() if self.what is None else f"{self.what}: {self._reason()}"))
+
+    def without(self, what: object) -> str:
+        """Return the line without `what`, for a place that names it already; a line about something else is whole."""
+        return _one_line(self._reason()) if self.what == str(what) else str(self)
+
+    def _reason(self) -> str:
+        return "; ".join(filter(None, (self.why, self.accepted and f"accepted: {self.accepted}")))
+
+
+class Unknown(BadInput):
+    """A key, an option or another name that does not exist."""
 
 
 class RunFailed(RuntimeError):  # noqa: N818 - reads as what it is at the raise site
@@ -30,12 +51,13 @@ class RunFailed(RuntimeError):  # noqa: N818 - reads as what it is at the raise 
 
 
 @contextmanager
-def reading(what: object, accepted: str = "") -> Iterator[None]:
+def reading(what: object, accepted: str = "", why: str = "") -> Iterator[None]:
     """Turn any error while a user's value or file is read, composed or built into `BadInput`.
 
     Args:
         what: the key with its value, or the file.
         accepted: what would be accepted, for the message.
+        why: what the error says of it, ahead of the error itself: ``not JSON``.
 
     Raises:
         BadInput: one line with `what`, the reason and what would be accepted.
@@ -45,8 +67,7 @@ def reading(what: object, accepted: str = "") -> Iterator[None]:
     except (BadInput, RunFailed):
         raise
     except Exception as error:  # a library can raise anything for a bad value or file
-        hint = f"; accepted: {accepted}" if accepted else ""
-        raise BadInput(f"{what}: {_reason(error)}{hint}") from error
+        raise BadInput(what, f"{why}: {_reason(error)}" if why else _reason(error), accepted) from error
 
 
 @contextmanager
@@ -64,10 +85,9 @@ def writing(
     try:
         yield
     except (OSError, also) as error:
-        hint = f"; accepted: {accepted}" if accepted else ""
-        raise failure(
-            f"{what}: cannot be written: {getattr(error, 'strerror', None) or error}{hint}"
-        ) from error
+        why = f"cannot be written: {getattr(error, 'strerror', None) or error}"
+        problem = BadInput(what, why, accepted)
+        raise (problem if failure is BadInput else failure(str(problem))) from error
 
 
 def is_refused_memory(error: BaseException) -> bool:

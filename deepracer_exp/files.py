@@ -57,7 +57,7 @@ def open_user_file(path: str | Path, accepted: str, most_bytes: int) -> IO[bytes
         found = Path(path).stat()
         if not stat.S_ISREG(found.st_mode):
             kind = _KINDS.get(stat.S_IFMT(found.st_mode), "no file")
-            raise BadInput(f"{path}: is {kind}; accepted: {accepted}")
+            raise BadInput(path, f"is {kind}", accepted)
         _check_size(path, found.st_size, accepted, most_bytes)
         return Path(path).open("rb")
 
@@ -91,7 +91,7 @@ def read_json(path: str | Path, accepted: str, raw: bytes | None = None) -> Any:
     """
     raw = read_bytes(path, accepted) if raw is None else raw
     _check_size(path, len(raw), accepted, SETTINGS_BYTES)
-    with reading(f"{path}: not JSON", accepted):
+    with reading(path, accepted, "not JSON"):
         return json.loads(raw.decode("utf-8-sig"))
 
 
@@ -112,7 +112,7 @@ def read_yaml(
     """
     raw = read_bytes(path, accepted) if raw is None else raw
     _check_size(path, len(raw), accepted, SETTINGS_BYTES)
-    with reading(f"{path}: not YAML", accepted):
+    with reading(path, accepted, "not YAML"):
         text = raw.decode("utf-8-sig")
         _check_structure(text)
         return _LOADER(text).get_single_data() if load is None else load(text)
@@ -160,7 +160,7 @@ def _validated(path: str | Path, raw: bytes, adapter: "TypeAdapter[Content]", ac
     except ValidationError as error:
         finding = error.errors(include_url=False)[0]
         where = "".join(f" {part}:" for part in finding["loc"])
-        raise BadInput(f"{path}:{where} {finding['msg']}; accepted: {accepted}") from error
+        raise BadInput(f"{path}:{where} {finding['msg']}", accepted=accepted) from error
 
 
 def atomic_write(path: Path, content: str | bytes) -> Path:
@@ -179,7 +179,7 @@ def atomic_write(path: Path, content: str | bytes) -> Path:
 
 def _check_size(path: str | Path, size: int, accepted: str, most_bytes: int) -> None:
     if size > most_bytes:
-        raise BadInput(f"{path}: is larger than {most_bytes // 2**20} MiB; accepted: {accepted}")
+        raise BadInput(path, f"is larger than {most_bytes // 2**20} MiB", accepted)
 
 
 def _check_structure(text: str) -> None:

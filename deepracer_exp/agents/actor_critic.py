@@ -151,9 +151,7 @@ def _own_network(network: OwnClass, observed: ObservationShape, outputs: int) ->
         found = copy.deepcopy(own).eval()(*seen)
     shape = tuple(found.shape) if isinstance(found, Tensor) else type(found).__name__
     if shape != (2, outputs):
-        raise BadInput(
-            f"{what}: returns {shape} for two observations; accepted: a tensor of shape (2, {outputs})"
-        )
+        raise BadInput(what, f"returns {shape} for two observations", f"a tensor of shape (2, {outputs})")
     return own
 
 

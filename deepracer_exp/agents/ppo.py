@@ -475,8 +475,6 @@ def build_agent(
             agent = build_own(own, "algorithm.target", Algorithm, actor_critic, config, schedule, seed)
     if config.smoothness:
         if not isinstance(agent, PPO):
-            raise BadInput(
-                f"algorithm.smoothness={config.smoothness:g}: {config.target} is no PPO; accepted: 0"
-            )
+            raise BadInput(f"algorithm.smoothness={config.smoothness:g}", f"{config.target} is no PPO", "0")
         agent.smooth(commands)
     return agent

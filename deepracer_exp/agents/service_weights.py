@@ -149,10 +149,10 @@ def match_service(
     absent += [_LOG_STD] * (_LOG_STD in missing)
     for name in missing:
         if name != _LOG_STD and _scope(name) not in absent:
-            raise BadInput(f"{where}: has no tensor {name} of shape {list(targets[name])}")
+            raise BadInput(where, f"has no tensor {name} of shape {list(targets[name])}")
     for name, value in found.items():
         if not np.isfinite(value).all():
-            raise BadInput(f"{where}: {name}: is not finite; choose another checkpoint")
+            raise BadInput(where, f"{name}: is not finite; choose another checkpoint")
     return found, absent
 
 
@@ -166,7 +166,7 @@ def _match(
         if _UNUSED.search(name) or ours.endswith(f"/{_RESCALER}"):
             continue
         if ours in given:
-            raise BadInput(f"{where}: {name}: is of a second agent; accepted: a model of one")
+            raise BadInput(where, f"{name}: is of a second agent", "a model of one")
         given[ours] = value
     found = {name: given.pop(name) for name in targets if name in given}
     for name, shape in targets.items():
@@ -177,14 +177,12 @@ def _match(
                 found[name] = given.pop(match)
     for name, value in found.items():
         if value.shape != targets[name]:
-            raise BadInput(
-                f"{where}: {name}: has the shape {list(value.shape)}; accepted: {list(targets[name])}"
-            )
+            raise BadInput(where, f"{name}: has the shape {list(value.shape)}", list(targets[name]))
     if given:
         name = min(given)
         raise BadInput(
-            f"{where}: {name}: a tensor of shape {list(given[name].shape)} that the network of these files has "
-            f"no layer for"
+            where,
+            f"{name}: a tensor of shape {list(given[name].shape)} that the network of these files has no layer for",
         )
     return found
 

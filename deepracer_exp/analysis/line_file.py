@@ -42,7 +42,7 @@ def recorded_line(view: "LogView", episode: int | None) -> tuple["pd.DataFrame",
     """
     laps = view.episodes[view.episodes["lap_time_s"].notna()].sort_values("lap_time_s", kind="stable")
     if laps.empty:
-        raise BadInput(f"{view.name}: has no complete lap with its steps; accepted: a run or log with laps")
+        raise BadInput(view.name, "has no complete lap with its steps", "a run or log with laps")
     chosen = laps.iloc[0] if episode is None else _lap(view, laps, episode)
     wanted = (view.episodes["episode"] == chosen["episode"]).to_numpy()
     rows = view.of_episodes(wanted, "X", "Y", "track_speed_mps", "progress")
@@ -92,7 +92,7 @@ def check_line_file(file: str | None) -> None:
     """
     if file is not None and (Path(file).suffix not in SUFFIXES or not Path(file).absolute().parent.is_dir()):
         raise BadInput(
-            f"--line {file}: accepted: a name that ends in {', '.join(SUFFIXES)}, in an existing folder"
+            f"--line {file}", "", f"a name that ends in {', '.join(SUFFIXES)}, in an existing folder"
         )
 
 

@@ -212,7 +212,7 @@ def prepare(log: Recording | RunRecording, track: str | None = None) -> LogView:
     recording = log.recording if isinstance(log, RunRecording) else log
     steps = recording.steps
     if not len(steps):
-        raise BadInput(f"{recording.name}: no control steps; accepted: a training or a race with its trace")
+        raise BadInput(recording.name, "no control steps", "a training or a race with its trace")
     names = steps["track"].astype("category")
     training = (steps["stream"] == TRAINING).to_numpy()
     rows, of_training = names.value_counts(), names[training].value_counts()
@@ -221,7 +221,7 @@ def prepare(log: Recording | RunRecording, track: str | None = None) -> LogView:
     )
     name = track if track in logged else logged[0]
     if track is not None and track not in logged and len(logged) > 1:
-        raise BadInput(f"{recording.name}: track={track} was not driven on; accepted: {', '.join(logged)}")
+        raise BadInput(recording.name, f"track={track} was not driven on", ", ".join(logged))
     tracks, problems = find_courses(recording)
     here = (names == name).to_numpy()
     driven_on = steps[here]
@@ -230,7 +230,7 @@ def prepare(log: Recording | RunRecording, track: str | None = None) -> LogView:
         known, problems = course, ()
         course = directed(catalogue_track(track), catalogue_track(track, True), driven_on)
         if known is not None and not was_driven_on(course, driven_on):
-            raise BadInput(f"{recording.name}: track={track} was not driven on; accepted: {known.name}")
+            raise BadInput(recording.name, f"track={track} was not driven on", known.name)
     course = estimated_course(name, driven_on) if course is None else numbered_as_logged(course, driven_on)
     discount = float((recording.hyperparameters or {}).get("discount_factor", DISCOUNT))
     trained, episodes, timed = _episodes(recording, here & training, course, discount)

@@ -119,7 +119,7 @@ def commands_of_log(recording: Recording, track: str | None = None) -> Commands:
     complete, fast = int(np.isfinite(every_s).sum()), fast_laps(every_s)
     if not complete:
         raise BadInput(
-            f"{recording.name}: has no complete lap without a reset; accepted: a run or log with laps, or a track"
+            recording.name, "has no complete lap without a reset", "a run or log with laps, or a track"
         )
     of_view = np.split(fast, np.cumsum([len(one) for one in times_s])[:-1])
     sources = [
@@ -155,7 +155,7 @@ def check_count(wanted: int) -> None:
         BadInput: too few or too many.
     """
     if not FEWEST <= wanted <= MOST:
-        raise BadInput(f"--count {wanted}: accepted: {FEWEST} to {MOST}")
+        raise BadInput(f"--count {wanted}", "", f"{FEWEST} to {MOST}")
 
 
 def propose_actions(commands: Commands, wanted: int, car: CarConfig) -> ActionProposal:

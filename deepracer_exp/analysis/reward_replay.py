@@ -195,7 +195,7 @@ def replay_reward(
     """
     if view.course is None:
         why = str(view.problems[0]) if view.problems else view.name
-        raise BadInput(f"{why}: no step is on a known course, so no reward can be computed")
+        raise BadInput(why, "no step is on a known course, so no reward can be computed")
     steps = view.recording.steps
     here = (steps["track"] == view.track_name).to_numpy()
     # A course without a name in the log has been recognised.
@@ -233,7 +233,7 @@ def _at_once(
         return function(params.columns(some), params.track_params, track_index=params.track_index[some])
     except RewardFailed as error:
         at = f"{len(some):,} steps at once" if error.car is None else _place(steps, some[error.car])
-        raise BadInput(f"{function.source.path}: reward_batch {error.what} ({at})") from error
+        raise BadInput(function.source.path, f"reward_batch {error.what} ({at})") from error
 
 
 def _one_by_one(
@@ -248,9 +248,7 @@ def _one_by_one(
                 guard.restart()
     except (RewardFailed, Misconduct) as error:
         what = error.what if isinstance(error, RewardFailed) else str(error)
-        raise BadInput(
-            f"{function.source.path}: reward_function {what} ({_place(steps, some[at])})"
-        ) from error
+        raise BadInput(function.source.path, f"reward_function {what} ({_place(steps, some[at])})") from error
     return paid
 
 

@@ -94,7 +94,7 @@ def contributed_terms(
         what, cause = what_happened(error, source.path, time_limit_s)
         at = steps.iloc[evaluated[min(len(found), len(evaluated) - 1)]]
         place = f"episode {at['episode']}, step {at['steps']}"
-        raise BadInput(f"{source.path}: terms {what} ({place})") from cause
+        raise BadInput(source.path, f"terms {what} ({place})") from cause
     return pd.DataFrame(found, index=steps.index[evaluated]).fillna(0.0)
 
 

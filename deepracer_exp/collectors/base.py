@@ -97,7 +97,7 @@ def states_of(state: Mapping[str, Any], workers: int) -> list[Any]:
     names = by_worker(range(workers))
     if state and state.keys() != names.keys():
         raise BadInput(
-            f"the checkpoint does not fit: it has the cars of {count(len(state), 'worker')}; "
-            f"accepted by this collector: {len(names)}"
+            "the checkpoint does not fit",
+            f"it has the cars of {count(len(state), 'worker')}; accepted by this collector: {len(names)}",
         )
     return [state[name] for name in names if state]

@@ -18,7 +18,7 @@ def connect(address: str, asked_by: str) -> None:
         BadInput: Ray is not installed, or no cluster answers.
     """
     if importlib.util.find_spec("ray") is None:
-        raise BadInput(f"{asked_by}: needs Ray; install it with: pip install 'deepracer-exp[ray]'")
+        raise BadInput(asked_by, "needs Ray; install it with: pip install 'deepracer-exp[ray]'")
     import ray
     from ray._private import ray_constants
 

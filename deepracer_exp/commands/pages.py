@@ -29,7 +29,7 @@ def check_output(output: str | None) -> None:
         BadInput: its folder does not exist.
     """
     if output is not None and not Path(output).absolute().parent.is_dir():
-        raise BadInput(f"--output {output}: its folder does not exist; accepted: a file in a folder")
+        raise BadInput(f"--output {output}", "its folder does not exist", "a file in a folder")
 
 
 def page_name(kind: str, name: str) -> Path:
@@ -54,7 +54,7 @@ def existing_logs(what: str) -> Path | None:
         BadInput: it is "", or cannot be read.
     """
     if not what.strip():
-        raise BadInput(f"{what!r}: names nothing; accepted: {_ACCEPTED}")
+        raise BadInput(f"{what!r}", "names nothing", _ACCEPTED)
     with reading(what, _ACCEPTED):
         path = Path(what).expanduser()
         if not path.exists():
@@ -78,5 +78,4 @@ def run_or_logs(what: str, stores: Stores) -> Path:
     try:
         return resolve(what, stores.runs_dir, stores.uri).path
     except BadInput as error:
-        why = str(error).removeprefix(f"{what}: ")
-        raise BadInput(f"{what}: no such file or folder, and no run: {why}") from None
+        raise BadInput(what, f"no such file or folder, and no run: {error.without(what)}") from None

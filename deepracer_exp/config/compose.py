@@ -17,7 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from deepracer_exp.addresses import without_passwords
 from deepracer_exp.aws.worlds.catalogue import find_world
-from deepracer_exp.errors import BadInput, nearest, reading
+from deepracer_exp.errors import BadInput, Unknown, nearest, reading
 
 from . import acting, custom_files
 from .custom_files import FileOverrides, file_overrides, read_custom_files
@@ -140,7 +140,8 @@ def compose_entry(entry: str, overrides: Sequence[str], *, stored: bool = False)
         try:
             for override in changing:
                 if _is_taken_for_a_group(config, override) or not change(config, override):
-                    raise BadInput(_unknown_key(entry, override.key_or_group, config, choices))
+                    key = override.key_or_group
+                    raise Unknown(key, _unknown_key(entry, key, config, choices))
             mapping = plain(config)
         except OmegaConfBaseException as error:
             raise BadInput(f"{error.full_key or entry}: {first_line(error)}") from error
@@ -198,7 +199,7 @@ def check_option(group: str, name: object, key: str | None = None) -> None:
     """
     known, key = options(group), key or group
     if not isinstance(name, str):
-        raise BadInput(f"{override_line(key, name)}: no such {group}; options: {listed(group, known)}")
+        raise Unknown(override_line(key, name), f"no such {group}; options: {listed(group, known)}")
     if (own := own_option(group, name)) is not None:
         ConfigStore.instance().store(group=group, name=name, node=own)
         return
@@ -207,7 +208,7 @@ def check_option(group: str, name: object, key: str | None = None) -> None:
     hint = nearest(name, known)
     if key == group and f"{group}.file" in PLAIN_TEXT and Path(name).suffix in _FILES:
         hint = f" (did you mean {group}.file={name}?)"
-    raise BadInput(f"{key}={name}: no such {group}{hint}; options: {listed(group, known)}")
+    raise Unknown(f"{key}={name}", f"no such {group}{hint}; options: {listed(group, known)}")
 
 
 def check_choice(group: str, value: object) -> None:
@@ -292,22 +293,22 @@ def _is_taken_for_a_group(config: DictConfig, override: Override) -> bool:
 
 
 def _unknown_key(entry: str, key: str, config: DictConfig, choices: Mapping[str, str]) -> str:
-    """Return the message for an unknown key of composed values."""
+    """Return why a key is unknown among composed values."""
     if "/" in key:
-        return f"{key}: no such group{nearest(key, groups(entry))}; groups: {', '.join(groups(entry))}"
+        return f"no such group{nearest(key, groups(entry))}; groups: {', '.join(groups(entry))}"
     parent, _, leaf = key.rpartition(".")
     keys = list(_dotted(OmegaConf.to_container(config)))
     siblings = [k.rpartition(".")[2] for k in keys if parent and k.rpartition(".")[0] == parent]
     if siblings:
         option = f" with {parent}={choices[parent]}" if parent in choices else ""
-        return f"{key}: no such key{option}{nearest(leaf, siblings)}; known: {', '.join(siblings)}"
+        return f"no such key{option}{nearest(leaf, siblings)}; known: {', '.join(siblings)}"
     within = [k for k in keys if k.startswith(f"{key}.")]
     if within:
-        return f"{key}: no such group for {entry}; accepted: {', '.join(within)}"
+        return f"no such group for {entry}; accepted: {', '.join(within)}"
     close = nearest(key, keys)
     if not close:
         # Perhaps the right key in the wrong group, or without one.
         leaves = {k.rpartition(".")[2]: k for k in reversed(keys)}
         match = difflib.get_close_matches(leaf, leaves, n=1, cutoff=0.8)
         close = f" (did you mean {leaves[match[0]]}?)" if match else ""
-    return f"{key}: no such key{close}; `deepracer-exp {entry} --cfg` prints all of them"
+    return f"no such key{close}; `deepracer-exp {entry} --cfg` prints all of them"

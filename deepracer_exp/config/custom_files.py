@@ -135,23 +135,23 @@ class CustomFiles:
             key: getattr(given, key) for key in TAKEN if key != "term_cond_max_episodes" or key in given.given
         }
 
-    def remarks(self) -> list[str]:
-        """Return a line for each key that is not used or that needs an explanation."""
-        metadata = self._metadata_remarks(self.metadata) if self.metadata else ()
+    def remarks(self, besides: Sequence[str] = ()) -> list[str]:
+        """Return a line for each key that is not used or that needs an explanation, `besides` those of the metadata."""
+        metadata = self._metadata_remarks(self.metadata, besides) if self.metadata else ()
         learning = self._learning_remarks(self.hyperparameters) if self.hyperparameters else ()
         return [
             *(f"model_metadata.json: {what}: {why}" for what, why in metadata),
             *(f"hyperparameters.json: {what}: {why}" for what, why in learning),
         ]
 
-    def _metadata_remarks(self, metadata: ModelMetadata) -> Iterable[tuple[str, str]]:
+    def _metadata_remarks(self, metadata: ModelMetadata, besides: Sequence[str]) -> Iterable[tuple[str, str]]:
         values = {
             "sensor": ", ".join(metadata.sensor),
             "neural_network": metadata.neural_network,
             "version": metadata.version,
         }
         for key in metadata.given:
-            if key in NOT_APPLICABLE and not (key == "version" and self.car):
+            if key in NOT_APPLICABLE and key not in besides and not (key == "version" and self.car):
                 shown = f"{key}={values[key]}" if key in values else key
                 same = [" ".join(sensor_overrides(metadata))] if key == "sensor" else []
                 yield shown, " ".join([f"not applicable: {NOT_APPLICABLE[key]}", *same])
@@ -225,12 +225,12 @@ def read_custom_files(folder: str) -> CustomFiles:
     """
     accepted = f"a folder with {', '.join(list(PLACES)[:-1])} or {list(PLACES)[-1]}"
     if not folder:
-        raise BadInput(f"{KEY}='': no folder; accepted: {accepted}")
+        raise BadInput(f"{KEY}=''", "no folder", accepted)
     try:
         names = sorted(path.name for path in Path(folder).iterdir())
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise BadInput(f"{KEY} {folder}: cannot be read ({reason}); accepted: {accepted}") from error
+        raise BadInput(f"{KEY} {folder}", f"cannot be read ({reason})", accepted) from error
     workers, unused = _workers(folder, names)
     paths, left = {}, {}
     for name, places in PLACES.items():
@@ -253,7 +253,7 @@ def read_custom_files(folder: str) -> CustomFiles:
         # A file's name may contain line breaks.
         held = [" ".join(name.split()) for name in names[:5]] + ["..."] * (len(names) > 5)
         inside = f"; {unused[0]}" if unused else ""
-        raise BadInput(f"{KEY} {folder}: holds {', '.join(held) or 'nothing'}; accepted: {accepted}{inside}")
+        raise BadInput(f"{KEY} {folder}", f"holds {', '.join(held) or 'nothing'}", f"{accepted}{inside}")
     metadata = paths.get("model_metadata.json")
     learning = paths.get("hyperparameters.json")
     files = CustomFiles(
@@ -345,15 +345,9 @@ def file_overrides(files: CustomFiles, own: Mapping[str, str]) -> FileOverrides:
         else:
             notes.append(f"model_metadata.json: action_space: not used, because of {winner}")
 
-    if files.car is not None and files.metadata is not None:
-        winner = first_given(own, "car", "car.name")
-        if winner is None:
-            lines.append(override_line("car", files.car))
-            notes.append(f"model_metadata.json: version={files.metadata.version}: used as car={files.car}")
-        else:
-            notes.append(
-                f"model_metadata.json: version={files.metadata.version}: not used, because of {winner}"
-            )
+    car, applied = car_override(files, own)
+    lines += car
+    notes += applied
 
     taken = []
     for key, value in files.learning.items():
@@ -376,6 +370,16 @@ def file_overrides(files: CustomFiles, own: Mapping[str, str]) -> FileOverrides:
     job, applied = job_overrides(files.workers, own)
     notes += [*applied, *_left(files, own)]
     return FileOverrides(tuple([*lines, *job]), names, (*notes, *files.remarks()))
+
+
+def car_override(files: CustomFiles, own: Mapping[str, str]) -> tuple[list[str], list[str]]:
+    """Return the override for the car of a model, unless the user chose another, and a note; none without a version."""
+    if files.car is None or files.metadata is None:
+        return [], []
+    winner = first_given(own, "car", "car.name")
+    used = f"used as car={files.car}" if winner is None else f"not used, because of {winner}"
+    lines = [override_line("car", files.car)] if winner is None else []
+    return lines, [f"model_metadata.json: version={files.metadata.version}: {used}"]
 
 
 def _left(files: CustomFiles, own: Mapping[str, str]) -> list[str]:

@@ -58,7 +58,7 @@ class Range:
         last = round((_exact(self.high) - _exact(self.low)) / _exact(self.step))
         if last >= _MOST_VALUES:
             raise BadInput(
-                f"from {self.low} to {self.high}: more than {_MOST_VALUES:,} values to try one by one"
+                f"from {self.low} to {self.high}", f"more than {_MOST_VALUES:,} values to try one by one"
             )
         return [_at(self.low, self.step, at) for at in range(last + 1)]
 
@@ -86,9 +86,7 @@ def dimension(key: str, expression: str) -> Choices | Range:
     assert isinstance(value, Sweep)
     tags = value.tags - {"log"}
     if tags or (value.tags and isinstance(value, ChoiceSweep)):
-        raise BadInput(
-            f"{line}: tag {', '.join(sorted(value.tags))}; accepted: log, with a range or an interval"
-        )
+        raise BadInput(line, f"tag {', '.join(sorted(value.tags))}", "log, with a range or an interval")
     if isinstance(value, ChoiceSweep):
         return _choices(line, value.list)
     if isinstance(value, IntervalSweep):
@@ -133,7 +131,7 @@ def _options(override: Override, glob: Glob) -> list[str]:
     known = options(key)
     fitting = glob.filter(known)
     if not fitting:
-        raise BadInput(f"{line}: matches no {key}; options: {', '.join(known)}")
+        raise BadInput(line, f"matches no {key}; options: {', '.join(known)}")
     return [name if re.fullmatch(r"[\w-]+", name) else override_line("", name)[1:] for name in fitting]
 
 
@@ -144,7 +142,7 @@ def _choices(line: str, elements: Sequence[Any]) -> Choices:
         if isinstance(element, str | QuotedString | list | dict):
             value = _expression(element)
         if any(type(value) is type(one) and value == one for one in values):  # 1 == True
-            raise BadInput(f"{line}: {as_override('', value)[1:]} is listed twice")
+            raise BadInput(line, f"{as_override('', value)[1:]} is listed twice")
         values.append(value)
     return Choices(tuple(values))
 
@@ -160,7 +158,7 @@ def _expression(element: str | QuotedString | list[Any] | dict[Any, Any]) -> str
 def _interval(line: str, low: Number, high: Number, log: bool) -> Range:
     _check_finite(line, low, high)
     if low >= high:
-        raise BadInput(f"{line}: accepted: interval(LOW,HIGH), LOW < HIGH")
+        raise BadInput(line, "", "interval(LOW,HIGH), LOW < HIGH")
     _check_log(line, low, log)
     return Range(low, high, 1 if isinstance(low, int) and isinstance(high, int) else None, log)
 
@@ -182,7 +180,7 @@ def range_length(sweep: RangeSweep, line: str) -> int:
     if sweep.step != 0:
         count = math.ceil((_exact(sweep.stop) - _exact(sweep.start)) / _exact(sweep.step))
     if count < 1:
-        raise BadInput(f"{line}: has no values; accepted: range(FROM,BELOW,STEP)")
+        raise BadInput(line, "has no values", "range(FROM,BELOW,STEP)")
     return count
 
 
@@ -194,7 +192,7 @@ def _range(line: str, sweep: RangeSweep, log: bool) -> Range:
     low, high = min(first, last), max(first, last)
     _check_log(line, low, log)
     if log and (isinstance(low, float) or abs(step) != 1):
-        raise BadInput(f"{line}: a logarithmic scale has no steps; accepted: tag(log,interval(LOW,HIGH))")
+        raise BadInput(line, "a logarithmic scale has no steps", "tag(log,interval(LOW,HIGH))")
     return Range(low, high, abs(step), log)
 
 
@@ -212,9 +210,9 @@ def _exact(number: Number) -> Decimal:
 def _check_finite(line: str, *numbers: Number) -> None:
     for number in numbers:
         if not math.isfinite(number):
-            raise BadInput(f"{line}: {number} cannot be an end of a range; accepted: finite numbers")
+            raise BadInput(line, f"{number} cannot be an end of a range", "finite numbers")
 
 
 def _check_log(line: str, low: Number, log: bool) -> None:
     if log and low <= 0:
-        raise BadInput(f"{line}: {low} is not above 0; accepted with tag(log, ...): ends above 0")
+        raise BadInput(line, f"{low} is not above 0; accepted with tag(log, ...): ends above 0")

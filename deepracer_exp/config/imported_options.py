@@ -132,7 +132,7 @@ def _check_free(paths: Iterable[Path], name: str) -> None:
         for folder in (Path("conf"), *searched):
             taken = folder / path.relative_to("conf")
             if os.path.lexists(taken):
-                raise BadInput(f"--name {name}: {taken} exists already; accepted: a new name")
+                raise BadInput(f"--name {name}", f"{taken} exists already", "a new name")
 
 
 def _check_name(name: str) -> None:
@@ -140,11 +140,9 @@ def _check_name(name: str) -> None:
         safe_name(name)
         plain = parse_single(f"experiment={name}").value() == name == yaml.safe_load(name)
     except ValueError as error:
-        raise BadInput(f"--name {name!r}: {error}") from error
+        raise BadInput(f"--name {name!r}", error) from error
     if not plain or name.endswith(".yaml"):
-        raise BadInput(
-            f"--name {name}: would not be read as a name; accepted: a name that begins with a letter"
-        )
+        raise BadInput(f"--name {name}", "would not be read as a name", "a name that begins with a letter")
 
 
 def _option(source: str, values: Mapping[str, Any]) -> bytes:
@@ -167,7 +165,7 @@ def _write_all(texts: Mapping[Path, bytes]) -> None:
     except OSError as error:
         remove_options(texts)
         raise BadInput(
-            f"{error.filename}: cannot be written ({error.strerror}); your own options are written to ./conf"
+            error.filename, f"cannot be written ({error.strerror}); your own options are written to ./conf"
         ) from error
 
 

@@ -96,9 +96,9 @@ def _world(worker: JobSettings) -> str | None:
     found = find_world(worker.world + variant) or find_world(worker.world)
     if found is None:
         raise BadInput(
-            f"{worker.file}: {worker.keys['WORLD_NAME']}={worker.world[:80]}: no such world"
-            f"{nearest(worker.world, worlds())}; accepted: a name that `deepracer-exp tracks` lists, or track=NAME "
-            "beside it"
+            worker.file,
+            f"{worker.keys['WORLD_NAME']}={worker.world[:80]}: no such world{nearest(worker.world, worlds())}",
+            "a name that `deepracer-exp tracks` lists, or track=NAME beside it",
         )
     return found
 

@@ -24,7 +24,7 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from deepracer_exp.errors import BadInput, nearest
+from deepracer_exp.errors import BadInput, Unknown, nearest
 from deepracer_exp.files import read_yaml
 
 from .options import SWEEP, conf_dir, conf_dirs, find, groups, options, sweep_files
@@ -159,9 +159,9 @@ def composed(entry: str | None, lines: Sequence[str]) -> tuple[DictConfig, dict[
     except MissingConfigException as error:
         group, _, option = (error.missing_cfg_file or "").rpartition("/")
         hint = nearest(option, options(group)) if group in groups(entry or "train") else ""
-        raise BadInput(f"{group}={option}: no such {group or 'option'}{hint}") from error
+        raise Unknown(f"{group}={option}", f"no such {group or 'option'}{hint}") from error
     except (HydraException, OmegaConfBaseException) as error:
-        raise BadInput(f"{entry or lines}: {first_line(error)}") from error
+        raise BadInput(entry or lines, first_line(error)) from error
     chosen = config.hydra.runtime.choices.items()
     choices = {str(key): str(option).removesuffix(".yaml") for key, option in chosen if option is not None}
     with open_dict(config):

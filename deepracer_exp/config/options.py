@@ -45,11 +45,11 @@ def conf_dirs() -> list[Path]:
                 namesake = project / group / path.name
                 another = namesake.is_file() and namesake.read_bytes() != read_bytes(path, "an option")
                 if another or (group == "track" and path.stem in worlds() and not namesake.is_file()):
-                    raise BadInput(f"{path}: the project has another {group} of that name; rename the file")
+                    raise BadInput(path, f"the project has another {group} of that name; rename the file")
         return [project, own.resolve()]
     except OSError as error:
         raise BadInput(
-            f"{error.filename}: cannot be read ({error.strerror}); ./conf is for options of your own"
+            error.filename, f"cannot be read ({error.strerror}); ./conf is for options of your own"
         ) from error
 
 
@@ -64,7 +64,7 @@ def sweep_files() -> dict[str, Path]:
         for path in sorted(folder.glob("*.yaml")):
             namesake = files.setdefault(path.stem, path)
             if namesake != path and read_bytes(path, "an option") != read_bytes(namesake, "an option"):
-                raise BadInput(f"{path}: {namesake} has the same name; rename the file")
+                raise BadInput(path, f"{namesake} has the same name; rename the file")
     return files
 
 
@@ -103,7 +103,7 @@ def options_of(group: str) -> dict[str, str]:
         BadInput: there is no such group.
     """
     if group not in groups():
-        raise BadInput(f"{group}: no such group{nearest(group, groups())}; groups: {', '.join(groups())}")
+        raise BadInput(group, f"no such group{nearest(group, groups())}; groups: {', '.join(groups())}")
     return {name: _first_sentence(Path(find(f"{group}/{name}.yaml"))) for name in options(group)}
 
 

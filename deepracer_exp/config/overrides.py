@@ -41,7 +41,7 @@ def parse_single(override: str) -> Override:
     parsed = _parse(plain[1] + _quoted(plain[2]) if plain else override)
     if parsed.is_sweep_override():
         raise BadInput(
-            f"{override}: several values for one run; -m runs each of them, a list is written KEY=[A,B]"
+            override, "several values for one run; -m runs each of them, a list is written KEY=[A,B]"
         )
     return parsed
 
@@ -84,7 +84,7 @@ def _expression(value: object) -> str:
 
 def _parse(override: str) -> Override:
     if len(override) > _LONGEST:
-        raise BadInput(f"{override[:60]}...: {len(override):,} characters; accepted: up to {_LONGEST:,}")
+        raise BadInput(f"{override[:60]}...", f"{len(override):,} characters", f"up to {_LONGEST:,}")
     with reading(override):
         try:
             parsed: Sequence[Override] = OverridesParser.create().parse_overrides(
@@ -95,10 +95,10 @@ def _parse(override: str) -> Override:
             key, equals, value = override.partition("=")
             quotes = f"; a value with special characters needs quotes: \"{key}='{value}'\"" if equals else ""
             raise BadInput(
-                f"{override or repr('')}: not an override ({reason}); write GROUP=OPTION or KEY=VALUE{quotes}"
+                override or repr(""), f"not an override ({reason}); write GROUP=OPTION or KEY=VALUE{quotes}"
             ) from error
     if not parsed[0].key_or_group:
-        raise BadInput(f"{override}: no key before the equals sign; write GROUP=OPTION or KEY=VALUE")
+        raise BadInput(override, "no key before the equals sign; write GROUP=OPTION or KEY=VALUE")
     if _DIGIT.match(override):
         parsed[0].key_or_group = parsed[0].key_or_group.replace("track._", "track.", 1)
         parsed[0].input_line = override

@@ -123,7 +123,7 @@ def load_class(target: str, key: str) -> type:
     with reading(f"{key}={target}", "package.module:Class, installed or in the working folder"):
         found = getattr(importlib.import_module(module), name)
     if not isinstance(found, type):
-        raise BadInput(f"{key}={target}: is a {type(found).__name__}; accepted: a class")
+        raise BadInput(f"{key}={target}", f"is a {type(found).__name__}", "a class")
     return found
 
 
@@ -141,7 +141,7 @@ def build_own(own: OwnClass, key: str, base: type[Base], *arguments: Any) -> Bas
     """
     kind = load_class(own.target, key)
     if not issubclass(kind, base):
-        raise BadInput(f"{key}={own.target}: accepted: a subclass of {base.__module__}.{base.__qualname__}")
+        raise BadInput(f"{key}={own.target}", "", f"a subclass of {base.__module__}.{base.__qualname__}")
     signature = inspect.signature(kind)
     try:
         signature.bind(*arguments, **own.kwargs)

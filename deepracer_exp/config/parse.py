@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 from pydantic import TypeAdapter, ValidationError
 
 from deepracer_exp.aws.worlds.catalogue import worlds
-from deepracer_exp.errors import BadInput, nearest
+from deepracer_exp.errors import BadInput, Unknown, nearest
 
 from .experiment import Experiment
 from .own_class import GROUPS, load_class, own_classes
@@ -40,7 +40,7 @@ def parse_config(mapping: dict[str, Any], kind: type[Config]) -> Config:
         # JSON is the strict mode that still takes a YAML list for a tuple and 1 for 1.0.
         return _adapter(kind).validate_json(json.dumps(mapping), strict=True, extra="forbid")
     except ValidationError as error:
-        raise BadInput(_first_finding(mapping, error)) from error
+        raise _first_finding(mapping, error) from error
 
 
 def _adapter(kind: type[Config]) -> TypeAdapter[Config]:
@@ -65,18 +65,18 @@ def _check_combinations(experiment: Experiment) -> None:
     frames = algorithm.frames_per_iteration
     if frames is not None and algorithm.batch_size > frames:
         raise BadInput(
-            f"algorithm.batch_size={algorithm.batch_size} is larger than "
-            f"algorithm.frames_per_iteration={frames}: a minibatch cannot hold more steps than an iteration"
+            f"algorithm.batch_size={algorithm.batch_size} is larger than algorithm.frames_per_iteration={frames}",
+            "a minibatch cannot hold more steps than an iteration",
         )
     if frames is not None and frames < collector.cars:
         raise BadInput(
-            f"algorithm.frames_per_iteration={frames} is smaller than collector.cars={collector.cars}: "
-            "each car takes at least one step an iteration"
+            f"algorithm.frames_per_iteration={frames} is smaller than collector.cars={collector.cars}",
+            "each car takes at least one step an iteration",
         )
     if collector.mode == "in_process" and collector.processes not in (None, 1):
         raise BadInput(
-            f"collector.processes={collector.processes} with collector.mode=in_process: "
-            "choose collector=sync for several processes"
+            f"collector.processes={collector.processes} with collector.mode=in_process",
+            "choose collector=sync for several processes",
         )
     accepted = collector.accepted_processes
     if collector.processes not in (None, *accepted):
@@ -92,8 +92,8 @@ def _check_combinations(experiment: Experiment) -> None:
     limit_s, hang_s = experiment.reward.time_limit_s, collector.hang_timeout_s
     if collector.mode != "in_process" and limit_s >= hang_s:
         raise BadInput(
-            f"reward.time_limit_s={limit_s:g} is not below collector.hang_timeout_s={hang_s:g}: a worker waiting for "
-            "its reward function would count as hanging"
+            f"reward.time_limit_s={limit_s:g} is not below collector.hang_timeout_s={hang_s:g}",
+            "a worker waiting for its reward function would count as hanging",
         )
     delay, still = experiment.randomization.action_delay_steps[1], experiment.episode.immobilized_steps
     if still and delay + 1 >= still:
@@ -139,7 +139,7 @@ def _check_shape(key: str, track: TrackConfig) -> None:
         )
 
 
-def _first_finding(mapping: dict[str, Any], error: ValidationError) -> str:
+def _first_finding(mapping: dict[str, Any], error: ValidationError) -> BadInput:
     finding = error.errors(include_url=False)[0]
     path = [str(part) for part in finding["loc"]]
     absent = finding["type"] == "missing"
@@ -147,21 +147,27 @@ def _first_finding(mapping: dict[str, Any], error: ValidationError) -> str:
     key = _key_of(mapping, path, absent or unknown)
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
     if absent:
-        return f"{key}: missing{more}"
+        return BadInput(key, f"missing{more}")
     if unknown:
         parent = _lookup(mapping, key.split(".")[:-1])
         siblings = [k for k in parent if k != path[-1]] if isinstance(parent, dict) else []
-        return f"{key}: no such key{nearest(path[-1], siblings)}; known: {', '.join(siblings)}{more}"
+        return Unknown(key, f"no such key{nearest(path[-1], siblings)}; known: {', '.join(siblings)}{more}")
     value = finding.get("input")
     if finding["type"] == "union_tag_invalid":
         context = finding["ctx"]
         kind = context["discriminator"].strip("'")
-        return f"{key}.{kind}={context['tag']}: no such {kind}; accepted: {context['expected_tags']}{more}"
+        return Unknown(
+            f"{key}.{kind}={context['tag']}", f"no such {kind}", f"{context['expected_tags']}{more}"
+        )
     if finding["type"] == "value_error":
         # The message of a dataclass whose values contradict each other names its keys.
-        at = key if isinstance(value, dict) else f"{key}={_short(value)}"
-        return f"{at}: {finding['ctx']['error']}{more}" if key else f"{finding['ctx']['error']}{more}"
-    return f"{key}={_short(value)}: {finding['msg'][0].lower()}{finding['msg'][1:]}{more}"
+        why = f"{finding['ctx']['error']}{more}"
+        return (
+            BadInput(key if isinstance(value, dict) else f"{key}={_short(value)}", why)
+            if key
+            else BadInput(why)
+        )
+    return BadInput(f"{key}={_short(value)}", f"{finding['msg'][0].lower()}{finding['msg'][1:]}{more}")
 
 
 def _key_of(mapping: dict[str, Any], path: list[str], ends_in_key: bool) -> str:

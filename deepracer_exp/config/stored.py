@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from deepracer_exp.addresses import without_passwords
-from deepracer_exp.errors import BadInput, nearest
+from deepracer_exp.errors import BadInput, Unknown, nearest
 
 from . import acting, custom_files
 from .compose import Composition, compose_entry
@@ -47,8 +47,8 @@ def with_overrides(
     for one in parsed:
         if one.key_or_group in _WHOLE:
             raise BadInput(
-                f"{one.input_line}: would replace the whole experiment; give the groups and values to change, "
-                "such as track=Oval_track"
+                one.input_line,
+                "would replace the whole experiment; give the groups and values to change, such as track=Oval_track",
             )
     new: dict[str, str] = {}
     if chosen:
@@ -59,7 +59,7 @@ def with_overrides(
     for one in parsed:
         if one not in chosen:
             if one.is_delete() or one.package is not None:
-                raise BadInput(f"{one.input_line}: accepted here: GROUP=OPTION or KEY=VALUE")
+                raise BadInput(one.input_line, "accepted here: GROUP=OPTION or KEY=VALUE")
             _set(values, one.key_or_group, one.value())
     keys = [one.key_or_group for one in parsed]
     if stored:
@@ -119,7 +119,7 @@ def _touches(overridden: Sequence[str], key: str) -> bool:
 def _unknown(key: str, at: str, node: Any) -> BadInput:
     known = [str(name) for name in node] if isinstance(node, dict) else []
     leaf = at.rpartition(".")[2]
-    return BadInput(f"{key}: no such key{nearest(leaf, known)}; known there: {', '.join(known) or 'none'}")
+    return Unknown(key, f"no such key{nearest(leaf, known)}; known there: {', '.join(known) or 'none'}")
 
 
 def _short(value: Any) -> str:

@@ -192,7 +192,7 @@ def compose_sweep(overrides: Sequence[str], *, stored: bool = False) -> SweepReq
     train = _TrainOverrides()
     for override in entry.sweep.train:
         if parse_sweep(override).is_sweep_override():
-            raise BadInput(f"sweep.train: {override}: several values; the search space is sweep.space")
+            raise BadInput("sweep.train", f"{override}: several values; the search space is sweep.space")
         train.add(override)
     for key, expression in entry.sweep.space.items():
         dimension(key, expression)
@@ -216,7 +216,7 @@ class _TrainOverrides:
         parsed = parse_sweep(override)
         key = parsed.key_or_group
         if key == "name":
-            raise BadInput(f"{override}: the study's name is the experiment of its runs; write study=NAME")
+            raise BadInput(override, "the study's name is the experiment of its runs; write study=NAME")
         searched = self.space.pop(key, None) is not None
         self.base.pop(key, None)
         if parsed.is_sweep_override():
@@ -242,15 +242,15 @@ def _check_own(override: str) -> None:
     parsed = parse_sweep(override)
     if parsed.is_sweep_override():
         key, _, value = override.partition("=")
-        raise BadInput(f"{override}: accepted: one value; a list is written {key}=[{value}]")
+        raise BadInput(override, "", f"one value; a list is written {key}=[{value}]")
     if parsed.key_or_group.startswith("sweep.space"):
         raise BadInput(
-            f"{override}: write the key itself, as in algorithm.lr='tag(log,interval(1e-5,1e-3))'; "
-            "~KEY removes one"
+            override,
+            "write the key itself, as in algorithm.lr='tag(log,interval(1e-5,1e-3))'; ~KEY removes one",
         )
 
 
 def _check_searched(key: str, override: str) -> None:
     for refused, why in _NOT_SEARCHED.items():
         if key == refused or key.startswith(f"{refused}."):
-            raise BadInput(f"{override}: cannot be searched: {why}")
+            raise BadInput(override, f"cannot be searched: {why}")

@@ -12,7 +12,7 @@ from typing import Any
 from hydra.core.override_parser.types import Override
 
 from deepracer_exp.aws.worlds.catalogue import find_world, leaders, worlds
-from deepracer_exp.errors import BadInput, nearest
+from deepracer_exp.errors import BadInput, Unknown, nearest
 
 from .options import conf_dir, listed, options
 from .overrides import override_line, parse_single
@@ -132,16 +132,14 @@ def several_tracks(
 
 def _check(line: str, names: Sequence[str], known: Sequence[str]) -> None:
     if not names:
-        raise BadInput(
-            f"{line}: no track; accepted: {GROUP}=[A,B], {GROUP}={ALL}; tracks: {listed(GROUP, known)}"
-        )
+        raise BadInput(line, "no track", f"{GROUP}=[A,B], {GROUP}={ALL}; tracks: {listed(GROUP, known)}")
     for at, name in enumerate(names):
         if name not in known:
-            raise BadInput(
-                f"{line}: no such track {name}{nearest(name, known)}; options: {listed(GROUP, known)}"
+            raise Unknown(
+                line, f"no such track {name}{nearest(name, known)}; options: {listed(GROUP, known)}"
             )
         if name in names[:at]:
-            raise BadInput(f"{line}: {name} is listed twice; {GROUP}.{name}.weight=2 gives it twice the cars")
+            raise BadInput(line, f"{name} is listed twice; {GROUP}.{name}.weight=2 gives it twice the cars")
 
 
 def _check_single(changing: Sequence[Override], known: Sequence[str]) -> None:
@@ -150,8 +148,8 @@ def _check_single(changing: Sequence[Override], known: Sequence[str]) -> None:
         name, _, key = key.partition(".")
         if group == GROUP and name in known:
             raise BadInput(
-                f"{override.key_or_group}: accepted with several tracks ({GROUP}=[A,B]) only; with one track write "
-                f"{GROUP}.{key}"
+                override.key_or_group,
+                f"accepted with several tracks ({GROUP}=[A,B]) only; with one track write {GROUP}.{key}",
             )
 
 

@@ -98,9 +98,7 @@ def build_action_space(config: ActionSpaceConfig) -> ActionSpace:
         return _discrete(*zip(*metadata.actions, strict=True))
     if isinstance(config, DiscreteActionSpace):
         if not config.actions:
-            raise BadInput(
-                "action_space.actions: [] is empty; accepted: at least one steering_angle and speed"
-            )
+            raise BadInput("action_space.actions", "[] is empty", "at least one steering_angle and speed")
         return _discrete(
             [action.steering_angle for action in config.actions], [action.speed for action in config.actions]
         )
@@ -108,7 +106,7 @@ def build_action_space(config: ActionSpaceConfig) -> ActionSpace:
     for key, bounds in (("steering_angle", steering), ("speed", speed)):
         if bounds.low > bounds.high:
             raise BadInput(
-                f"action_space.{key}: low {bounds.low:g} is above high {bounds.high:g}; accepted: low <= high"
+                f"action_space.{key}", f"low {bounds.low:g} is above high {bounds.high:g}", "low <= high"
             )
     if isinstance(config, ContinuousActionSpace):
         low, high = (np.array([getattr(one, end) for one in (steering, speed)]) for end in ("low", "high"))

@@ -179,7 +179,7 @@ class DeepRacerVectorEnv(VectorEnv[Observed, NDArray[Any], NDArray[Any]]):
 def _checked(render_mode: str | None) -> str | None:
     accepted = _METADATA["render_modes"]
     if render_mode not in (None, *accepted):
-        raise BadInput(f"render_mode={render_mode}: not a way to render; accepted: {', '.join(accepted)}")
+        raise BadInput(f"render_mode={render_mode}", "not a way to render", ", ".join(accepted))
     return render_mode
 
 

@@ -46,7 +46,7 @@ def _build_part(own: OwnClass) -> ObservationPart:
     part, what = build_own(own, "observation.target", ObservationPart), f"observation.target={own.target}"
     names = part.names
     if not isinstance(names, tuple | list) or not names or not all(isinstance(name, str) for name in names):
-        raise BadInput(f'{what}: names={names!r}; accepted: a tuple of text, as in names = ("side_force",)')
+        raise BadInput(what, f"names={names!r}", 'a tuple of text, as in names = ("side_force",)')
     with reading(what):
         shape = np.shape(part.compute(Measures.example(2), np.zeros(2), np.zeros(2)))
     if shape != (2, len(names)):

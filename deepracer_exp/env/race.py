@@ -269,8 +269,8 @@ class Race:
         physics = checked_array(state, "physics", self._batch.state.shape)
         if not np.array_equal(checked_array(state, "cars", self.cars.shape), self.cars):
             raise BadInput(
-                f"the checkpoint does not fit: its first car has number {state['cars'][0]}; accepted here: "
-                f"{self.cars[0]}"
+                "the checkpoint does not fit",
+                f"its first car has number {state['cars'][0]}; accepted here: {self.cars[0]}",
             )
         for name in self._kept:
             setattr(self, name, checked_array(state, name.lstrip("_"), getattr(self, name).shape))

@@ -79,7 +79,7 @@ def require_car(experiment: Experiment) -> None:
         BadInput: it could not.
     """
     for refusal in car_refusals(experiment):
-        raise BadInput(f"evaluation.real_car: the car cannot run this policy: {refusal}")
+        raise BadInput("evaluation.real_car", f"the car cannot run this policy: {refusal}")
 
 
 def as_the_car(setup: "RaceSetup", real_car: RealCarConfig) -> "RaceSetup":

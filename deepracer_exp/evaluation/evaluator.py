@@ -173,7 +173,7 @@ def tracks_of(experiment: Experiment, config: EvaluationConfig) -> dict[str, Tra
     try:
         return compose_experiment([override_line("track", names)])[0].tracks
     except BadInput as error:
-        raise BadInput(f"evaluation.tracks: {error}") from None
+        raise BadInput("evaluation.tracks", error) from None
 
 
 def _courses(tracks: dict[str, TrackConfig]) -> tuple[Course, ...]:
@@ -193,7 +193,7 @@ def _conditions(key: str, option: str | None, experiment: Experiment) -> Randomi
     try:
         return compose_option("randomization", option, RandomizationConfig)
     except BadInput as error:
-        raise BadInput(f"evaluation.{key}: {error}") from None
+        raise BadInput(f"evaluation.{key}", error) from None
 
 
 def _starts(config: EvaluationConfig, closed: bool, condition: str) -> NDArray[np.float64]:

@@ -70,7 +70,7 @@ def write_aws_logs(log: RunRecording, experiment: Experiment, folder: Path, layo
     with writing(folder, "another folder with -o"):
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
-            raise BadInput(f"--output {folder}: is not empty; accepted: a new or an empty folder")
+            raise BadInput(f"--output {folder}", "is not empty", "a new or an empty folder")
         write_files(texts, folder)
         write_trace(numbered, folder / PLACES[layout]["trace"], text_log, head)
     rows, episodes = count(len(numbered.rows), "row"), count(len(numbered.episodes), "episode")

@@ -93,9 +93,7 @@ def _refuse_other_sensors(experiment: Experiment, metadata: ModelMetadata) -> No
             "of this kind sees"
         )
     if abs(lidar.yaw_deg) != 180:
-        raise BadInput(
-            f"observation.lidar.yaw_deg={lidar.yaw_deg:g}: accepted: 180, as the service mounts it"
-        )
+        raise BadInput(f"observation.lidar.yaw_deg={lidar.yaw_deg:g}", "", "180, as the service mounts it")
 
 
 def services_kind(experiment: Experiment, metadata: ModelMetadata) -> str:
@@ -119,7 +117,7 @@ def services_kind(experiment: Experiment, metadata: ModelMetadata) -> str:
             f"network={option}" + "".join(f" network.{key}={value}" for key, value in values.items())
         )
     shown = ", ".join(f"{key}={list(value)}" for key, value in own.items())
-    raise BadInput(f"network: {shown}: the service builds no such network; accepted: {'; or '.join(options)}")
+    raise BadInput("network", f"{shown}: the service builds no such network", "; or ".join(options))
 
 
 def _with_value(experiment: Experiment, networks: ActorCritic) -> tuple[ActorCritic, list[str]]:

@@ -58,7 +58,7 @@ def export_car(run: StoredRun, config: ExportConfig, path: Path) -> Written:
     """Write the archive of a policy for a physical car; arguments, result and errors as for `export.Writer`."""
     if not path.name.endswith(ENDING) or path.is_dir():
         raise BadInput(
-            f"--output {path}: accepted: a file whose name ends in {ENDING}, as the car's console wants it"
+            f"--output {path}", "", f"a file whose name ends in {ENDING}, as the car's console wants it"
         )
     stored = stored_policy(run, config)
     archive = car_archive(stored.networks, run.experiment)

@@ -31,7 +31,7 @@ TOLERANCE = 1e-4
 def export_onnx(run: StoredRun, config: ExportConfig, path: Path) -> Written:
     """Write the policy of a run as an ONNX file; arguments, result and errors as for `export.Writer`."""
     if path.is_dir():
-        raise BadInput(f"--output {path}: is a folder; give a file, e.g. {path / 'policy.onnx'}")
+        raise BadInput(f"--output {path}", f"is a folder; give a file, e.g. {path / 'policy.onnx'}")
     stored = stored_policy(run, config)
     actions = build_action_space(run.experiment.action_space)
     torch.set_num_threads(1)
@@ -121,8 +121,8 @@ def write_onnx(
         import onnxscript  # noqa: F401
     except ImportError as error:
         raise BadInput(
-            f"format=onnx: needs the package {error.name}; install the project with its extra: "
-            "pip install 'deepracer-exp[export]'"
+            "format=onnx",
+            f"needs the package {error.name}; install the project with its extra: pip install 'deepracer-exp[export]'",
         ) from error
     observations = _observations(observed)
     program = _program(model.eval(), [values[:2] for values in observations])

@@ -39,24 +39,23 @@ def best_of(experiment: str, runs_dir: Path) -> Path:
     try:
         folder = runs_dir / safe_name(experiment)
     except ValueError as error:
-        raise BadInput(f"{what}: {error}") from None
+        raise BadInput(what, error) from None
     if (of_sweep := best_run_of_sweep(folder)) is not None:
         return of_sweep
     runs = sorted(file.parent for file in folder.glob(f"*/{CONFIG}"))
     if not runs:
         known = sorted({run.parent.name for run in run_folders(runs_dir)})
         raise BadInput(
-            f"{what}: no such experiment in {runs_dir}{nearest(experiment, known)}; "
-            f"experiments there: {', '.join(known[:10]) or 'none'}"
+            what,
+            f"no such experiment in {runs_dir}{nearest(experiment, known)}; experiments there: "
+            f"{', '.join(known[:10]) or 'none'}",
         )
     results = {run: result for run in runs if (result := _result(run)) is not None}
     results = {run: one for run, one in results.items() if one.evaluated} or results
     if not results:
         if len(runs) == 1 and (runs[0] / CHECKPOINTS / "best").is_dir():
             return runs[0]
-        raise BadInput(
-            f"{what}: none of its {len(runs)} runs has a result and a checkpoint `best`; give a run"
-        )
+        raise BadInput(what, f"none of its {len(runs)} runs has a result and a checkpoint `best`; give a run")
     _check_comparable(what, results)
     return max(results, key=lambda run: (results[run].rank, run.name))
 
@@ -103,11 +102,11 @@ def best_run_of_sweep(folder: Path) -> Path | None:
     run = folder / best.run_dir
     if not is_run(run):
         raise BadInput(
-            f"{folder / BEST_OF_SWEEP}: run {best.run_dir} of trial {best.trial} is gone; give another run, "
-            f"or delete this file"
+            folder / BEST_OF_SWEEP,
+            f"run {best.run_dir} of trial {best.trial} is gone; give another run, or delete this file",
         )
     if run.resolve().parent != folder.resolve():
-        raise BadInput(f"{folder / BEST_OF_SWEEP}: run {best.run_dir} is a link that leads out of {folder}")
+        raise BadInput(folder / BEST_OF_SWEEP, f"run {best.run_dir} is a link that leads out of {folder}")
     return run
 
 
@@ -127,8 +126,9 @@ def _check_comparable(what: str, results: Mapping[Path, RunResult]) -> None:
             if _short(one) == _short(other):  # of one name
                 key, (one, other) = next(iter(config_differences([{key: one}, {key: other}]).items()))
             raise BadInput(
-                f"{what}: its runs cannot be ranked: {key} is {_short(one)} in {first.name} and {_short(other)} in "
-                f"{run.name}; name one of them, and train what differs under another name="
+                what,
+                f"its runs cannot be ranked: {key} is {_short(one)} in {first.name} and {_short(other)} in "
+                f"{run.name}; name one of them, and train what differs under another name=",
             )
 
 

@@ -43,7 +43,7 @@ class StoredRun:
         try:
             return parse_experiment(mapping)
         except BadInput as error:
-            raise BadInput(f"{self.path / CONFIG}: {error}; was the run made by another version?") from None
+            raise BadInput(self.path / CONFIG, f"{error}; was the run made by another version?") from None
 
     @property
     def checkpoints(self) -> Path:
@@ -97,18 +97,16 @@ def resolve(run: str, runs_dir: Path, tracking_uri: str | None) -> StoredRun:
         return StoredRun(matches[0])
     if matches:
         names = ", ".join(str(folder.relative_to(runs_dir)) for folder in matches[:3])
-        raise BadInput(f"{run}: ambiguous: {len(matches)} runs match: {names}{', ...' * (len(matches) > 3)}")
-    unknown = (
-        f"{run}: no such run in {runs_dir} ({len(folders)} there){nearest(run, [f.name for f in folders])}"
-    )
+        raise BadInput(run, f"ambiguous: {len(matches)} runs match: {names}{', ...' * (len(matches) > 3)}")
+    unknown = f"no such run in {runs_dir} ({len(folders)} there){nearest(run, [f.name for f in folders])}"
     if any(folder.parent.name == run for folder in folders):
         unknown += f"; {BEST}{run} is the best run of that experiment"
     if not is_alias(run) or not has_store(tracking_uri, runs_dir):
-        raise BadInput(f"{unknown}; accepted: {RUN}")
+        raise BadInput(run, unknown, RUN)
     try:
         registered = look_up(run, tracking_uri, runs_dir)
     except BadInput as error:
-        raise BadInput(f"{unknown}; {str(error).removeprefix(f'{run}: ')}") from None
+        raise BadInput(run, f"{unknown}; {error.without(run)}") from None
     return _of_registered(run, registered, runs_dir, tracking_uri)
 
 
@@ -123,8 +121,9 @@ def _of_registered(run: str, found: Registered, runs_dir: Path, tracking_uri: st
     verify(checkpoint)
     if checkpoint_sha256(checkpoint) != found.sha256:
         raise BadInput(
-            f"{run}: {checkpoint} is not the checkpoint that was registered as {found}, version {found.version}: "
-            "its hash differs; give the run and checkpoint= to use it anyway"
+            run,
+            f"{checkpoint} is not the checkpoint that was registered as {found}, version {found.version}: its hash "
+            "differs; give the run and checkpoint= to use it anyway",
         )
     return StoredRun(path, found.checkpoint, str(found))
 
@@ -134,7 +133,7 @@ def _present(run: str, folder: Path, runs_dir: Path) -> Path:
     moved = runs_dir / folder.parent.name / folder.name
     found = next((place for place in (folder, moved) if is_run(place)), None)
     if found is None:
-        raise BadInput(f"{run}: its folder {folder} is gone; give the folder where it is now")
+        raise BadInput(run, f"its folder {folder} is gone; give the folder where it is now")
     return found
 
 
@@ -147,7 +146,7 @@ def folder_of(run_id: str, uri: str | None, runs_dir: Path) -> Path:
     with open_client(run_id, uri, runs_dir) as client:
         run = client.get_run(run_id)
     if run.info.lifecycle_stage != "active":
-        raise BadInput(f"{run_id}: was deleted in MLflow; restore it there")
+        raise BadInput(run_id, "was deleted in MLflow; restore it there")
     if "run_dir" not in run.data.tags:
-        raise BadInput(f"{run_id}: has no tag run_dir, so it is not a run of deepracer-exp")
+        raise BadInput(run_id, "has no tag run_dir, so it is not a run of deepracer-exp")
     return Path(run.data.tags["run_dir"])

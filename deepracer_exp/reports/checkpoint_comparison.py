@@ -108,7 +108,7 @@ def compare_checkpoints(
             env_steps = stored.counters["env_steps"]
             figures = lap_statistics(evaluation, run.experiment.checkpoints.metric)
         except BadInput as error:
-            fault = str(error).removeprefix(f"{path.resolve()}: ")
+            fault = error.without(path.resolve())
         yield CheckpointResult(
             name=path.name,
             labels=tuple(label for label, target in leads_to.items() if target == path.resolve()),
@@ -253,7 +253,7 @@ def show_checkpoints(
     """
     kept = kept_checkpoints(run.checkpoints)
     if not kept:
-        raise BadInput(f"{run.checkpoints}: contains no checkpoint")
+        raise BadInput(run.checkpoints, "contains no checkpoint")
     for link in (run.checkpoints / label for label in LINKS):
         if link.is_symlink() and not link.exists():
             logger.warning("%s is a broken link", link)

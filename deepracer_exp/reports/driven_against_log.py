@@ -86,7 +86,7 @@ def course_driven(
             return replace(config, direction="reversed" if track is backward else "forward"), track
     length_m = float(view.steps["track_len"].median())
     if given is not None:
-        raise BadInput(f"--track {given}: is not where the car of {view.name} drove ({length_m:.2f} m)")
+        raise BadInput(f"--track {given}", f"is not where the car of {view.name} drove ({length_m:.2f} m)")
     raise BadInput(
         f"{view.name}: its track {view.track_name!r} ({length_m:.2f} m) is none of the service's worlds and none that "
         "the run was trained on; accepted: --track with the file of its route (.npy)"

@@ -87,7 +87,7 @@ def commands_of_run(run: StoredRun, checkpoint: str | None) -> Commands:
     name = f"{run.path.name}, checkpoint {stored.path.name}"
     if not steps:
         tried = count(len(evaluation.on(USUAL).attempts), "lap")
-        raise BadInput(f"{name}: completes none of {tried} without a reset; accepted: a run that does")
+        raise BadInput(name, f"completes none of {tried} without a reset", "a run that does")
     rows = np.concatenate(steps)
     # In the prepare step nothing is commanded yet.
     rows = rows[rows[:, PACKED["episode_status"]] != STATUS_CODE["prepare"]]

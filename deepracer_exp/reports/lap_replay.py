@@ -75,7 +75,7 @@ def laps_of_log(view: LogView, rival: LogView | None) -> list[ReplayedLap]:
         return [first, fastest_lap_of_log(rival, first)]
     if view.episodes["lap_time_s"].notna().sum() < 2:
         raise BadInput(
-            f"{view.name}: has one complete lap only; accepted: another run or log beside it to replay against"
+            view.name, "has one complete lap only", "another run or log beside it to replay against"
         )
     fastest = int(view.episodes["lap_time_s"].idxmin())
     return [first, _lap(view, ordinary_lap(view.episodes, fastest), "an ordinary lap")]
@@ -89,7 +89,7 @@ def fastest_lap_of_log(view: LogView, beside: ReplayedLap | None = None) -> Repl
     """
     laps = view.episodes["lap_time_s"].dropna()
     if not len(laps):
-        raise BadInput(f"{view.name}: has no complete lap with its steps; accepted: a run or log with laps")
+        raise BadInput(view.name, "has no complete lap with its steps", "a run or log with laps")
     if beside is not None:
         places = view.steps["lap_position"].to_numpy(np.float64)[first_rows(view.steps)]
         same = laps[is_same_start(places, beside)[laps.index]]
@@ -104,7 +104,7 @@ def is_same_start(places: Values, beside: ReplayedLap) -> NDArray[np.bool_]:
 
 def _lap(view: LogView, episode: int, which: str) -> ReplayedLap:
     if view.course is None:
-        raise BadInput(f"{view.name}: its track is not known; accepted: with --track NAME or a file")
+        raise BadInput(view.name, "its track is not known", "with --track NAME or a file")
     row, rows = view.episodes.loc[episode], view.steps[view.episode_index == episode]
     lap_time_s, tstamp = float(row["lap_time_s"]), rows["tstamp"].to_numpy(np.float64)
     where = f"iteration {row['iteration']}, " if view.trained else f"{row['stream']}, "
@@ -135,7 +135,7 @@ def write_replay(path: Path, laps: Sequence[ReplayedLap]) -> Path:
     laps = [replace(lap, track=laps[0].track) for lap in laps]
     if not laps[1].fits:
         raise BadInput(
-            f"{laps[1].name}: drove on {titles[1]}, {laps[0].name} on {titles[0]}; accepted: two laps on the same track"
+            laps[1].name, f"drove on {titles[1]}, {laps[0].name} on {titles[0]}", "two laps on the same track"
         )
     names = [f"{letter}  {lap.name}" for letter, lap in zip("AB", laps, strict=True)]
     chart = _chart(titles[0], laps)

@@ -33,7 +33,7 @@ class LiveServer(ThreadingHTTPServer):
         except OSError as error:
             reason = str(error.strerror or error).lower()
             raise BadInput(
-                f"--port {port}: {reason} on {HOST}; accepted: a free port, or no --port for any"
+                f"--port {port}", f"{reason} on {HOST}", "a free port, or no --port for any"
             ) from None
 
     def handle_error(self, request: Any, client_address: Any) -> None:

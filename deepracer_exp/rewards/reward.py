@@ -95,7 +95,7 @@ class RewardFunction:
         except BaseException as error:  # noqa: BLE001 - raised again as one of ours
             what, cause = what_happened(error, source.path, time_limit_s)
             how = "" if isinstance(error, Unusable) else "cannot be run: "
-            raise BadInput(f"{source.path}: {how}{what}") from cause
+            raise BadInput(source.path, f"{how}{what}") from cause
         self._track_params: Sequence[TrackParams] = ()
         self._waypoints: list[np.ndarray] = []
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from deepracer_exp.config.driving import RewardConfig
 from deepracer_exp.config.options import project_dir
-from deepracer_exp.errors import BadInput, nearest, reading
+from deepracer_exp.errors import BadInput, Unknown, nearest, reading
 from deepracer_exp.files import read_bytes
 
 
@@ -63,9 +63,8 @@ def load_reward_source(config: RewardConfig) -> RewardSource:
     for key in config.constants:
         if key not in constants:
             known = ", ".join(constants) or "none; a constant is a line NAME = number with NAME in capitals"
-            raise BadInput(
-                f"reward.constants.{key}: {path} has no such constant{nearest(key.upper(), constants)}: {known}"
-            )
+            why = f"{path} has no such constant{nearest(key.upper(), constants)}: {known}"
+            raise Unknown(f"reward.constants.{key}", why)
     overrides = {key: _like(constants[key], value) for key, value in config.constants.items()}
     return RewardSource(name, path, text, hashlib.sha256(data).hexdigest(), constants, overrides)
 
@@ -117,7 +116,7 @@ def _zoo_file(name: str) -> tuple[str, bytes]:
     known = zoo_names()
     if name not in known:
         raise BadInput(
-            f"reward.name: {name!r} is not in the reward zoo{nearest(name, known)}: {', '.join(known)}"
+            "reward.name", f"{name!r} is not in the reward zoo{nearest(name, known)}: {', '.join(known)}"
         )
     file = project_dir(_ZOO) / f"{name}.py"
     return str(file), file.read_bytes()
@@ -132,15 +131,15 @@ def _decode(path: str, data: bytes) -> str:
 def _parse(path: str, text: str) -> ast.Module:
     before, null, _ = text.partition("\0")
     if null:  # the compiler names no line
-        raise BadInput(f"{path}: line {before.count(chr(10)) + 1}: a null byte; this is not valid Python")
+        raise BadInput(path, f"line {before.count(chr(10)) + 1}: a null byte; this is not valid Python")
     try:
         # Compiling finds what parsing lets through, such as a `return` outside a function.
         compile(text, path, "exec", dont_inherit=True)
         return ast.parse(text, filename=path)
     except SyntaxError as error:
-        raise BadInput(f"{path}: line {error.lineno}: {error.msg}; this is not valid Python") from error
+        raise BadInput(path, f"line {error.lineno}: {error.msg}; this is not valid Python") from error
     except (ValueError, RecursionError, MemoryError) as error:  # nesting too deep for the parser
-        raise BadInput(f"{path}: is not valid Python: {error or 'too deeply nested'}") from error
+        raise BadInput(path, f"is not valid Python: {error or 'too deeply nested'}") from error
 
 
 def _check_function(path: str, tree: ast.Module) -> None:
@@ -155,17 +154,17 @@ def _check_function(path: str, tree: ast.Module) -> None:
         # The service also accepts a callable object of that name; it is checked when the module is run.
         if "reward_function" not in assigned:
             hint = nearest("reward_function", functions)
-            raise BadInput(f"{path}: has no function reward_function(params){hint}")
+            raise BadInput(path, f"has no function reward_function(params){hint}")
         return
     where = f"{path}: line {function.lineno}"
     if isinstance(function, ast.AsyncFunctionDef):
-        raise BadInput(f"{where}: reward_function must be a plain function, not an async one")
+        raise BadInput(where, "reward_function must be a plain function, not an async one")
     for name in ("reward_function", "reward_batch"):
         candidate = functions.get(name)
         if candidate is not None and not _takes_one_argument(candidate.args):
             line = f"{path}: line {candidate.lineno}"
             raise BadInput(
-                f"{line}: {name}({ast.unparse(candidate.args)}) must take one argument: {name}(params)"
+                line, f"{name}({ast.unparse(candidate.args)}) must take one argument: {name}(params)"
             )
 
 

@@ -32,10 +32,10 @@ def verify(folder: Path) -> None:
         wanted = dict(json.loads((folder / HASHES).read_text(encoding="utf-8")))
         found = {path: _sha256(folder / path) for path in _files(folder)}
     except (OSError, ValueError, TypeError) as error:
-        raise BadInput(f"{folder}: corrupt: {HASHES} cannot be used: {error}") from error
+        raise BadInput(folder, f"corrupt: {HASHES} cannot be used: {error}") from error
     if found != wanted:
         changed = sorted(set(found.items()) ^ set(wanted.items()))
-        raise BadInput(f"{folder}: corrupt: {changed[0][0]} is not as it was written")
+        raise BadInput(folder, f"corrupt: {changed[0][0]} is not as it was written")
 
 
 def restore_links(folder: Path) -> None:
@@ -76,7 +76,7 @@ def find_checkpoint(folder: Path, name: str) -> Path:
         BadInput: there is no such checkpoint, or it lies elsewhere.
     """
     if not re.fullmatch(r"best|last|\d{1,9}", name):
-        raise BadInput(f"checkpoint={name}: a checkpoint is best, last or the number of an iteration")
+        raise BadInput(f"checkpoint={name}", "a checkpoint is best, last or the number of an iteration")
     restore_links(folder)
     path = folder / (f"{int(name):06d}" if name.isdecimal() else name)
     kept = kept_checkpoints(folder)
@@ -84,10 +84,10 @@ def find_checkpoint(folder: Path, name: str) -> Path:
         known = ", ".join(
             [*(link for link in LINKS if (folder / link).is_symlink()), *(p.name for p in kept)]
         )
-        raise BadInput(f"checkpoint={name}: {path} is not there; checkpoints: {known or 'none'}")
+        raise BadInput(f"checkpoint={name}", f"{path} is not there; checkpoints: {known or 'none'}")
     if path.exists() and path.resolve().parent != folder.resolve():
         raise BadInput(
-            f"checkpoint={name}: {path} leads out of its folder to {path.resolve()}; give a number"
+            f"checkpoint={name}", f"{path} leads out of its folder to {path.resolve()}; give a number"
         )
     return path
 
@@ -133,7 +133,7 @@ def pinned(checkpoints: Path) -> dict[str, list[str]]:
             str(name): list(reasons) for name, reasons in json.loads(file.read_text(encoding="utf-8")).items()
         }
     except (OSError, ValueError, AttributeError) as error:
-        raise BadInput(f"{file}: cannot be read: {error}; nothing in {checkpoints} is removed") from error
+        raise BadInput(file, f"cannot be read: {error}; nothing in {checkpoints} is removed") from error
 
 
 def _files(folder: Path) -> list[str]:

@@ -90,7 +90,7 @@ def intact_checkpoint(folder: Path, name: str, *, resumable: bool = False) -> Pa
             why = "; ".join(reasons)
             logger.warning("checkpoint=%s: %s; using %s, the newest intact one", name, why, found.name)
         return found
-    raise BadInput(f"checkpoint={name}: {'; '.join(reasons[:3])}; no checkpoint in {folder} is intact")
+    raise BadInput(f"checkpoint={name}", f"{'; '.join(reasons[:3])}; no checkpoint in {folder} is intact")
 
 
 def check(path: Path, *, resumable: bool = False) -> Path:
@@ -101,41 +101,42 @@ def check(path: Path, *, resumable: bool = False) -> Path:
     """
     if not path.is_dir():
         kind = "a broken link" if path.is_symlink() else "no folder"
-        raise BadInput(f"{path}: is {kind}; a pickle is never loaded")
+        raise BadInput(path, f"is {kind}; a pickle is never loaded")
     path = path.resolve()
     entries = list(path.rglob("*"))
     links = [entry for entry in entries if entry.is_symlink()]
     if links:
-        raise BadInput(f"{links[0]}: is a link; the files of a checkpoint must be in its own folder")
+        raise BadInput(links[0], "is a link; the files of a checkpoint must be in its own folder")
     files = {file.name for file in entries if not file.is_dir()}
     foreign = sorted(files - _STATE - {MANIFEST, HASHES})
     if foreign:
         raise BadInput(
-            f"{path}: contains {foreign[0]}; accepted: the tensors and JSON files of a checkpoint; a pickle is "
-            "never loaded"
+            path,
+            f"contains {foreign[0]}",
+            "the tensors and JSON files of a checkpoint; a pickle is never loaded",
         )
     if (total := sum(entry.stat().st_size for entry in entries)) > _MOST_BYTES:
-        raise BadInput(f"{path}: has {total:,} bytes; accepted: up to {_MOST_BYTES // 2**30} GiB")
+        raise BadInput(path, f"has {total:,} bytes", f"up to {_MOST_BYTES // 2**30} GiB")
     for name in (MANIFEST, HASHES):
         if name not in files:
-            raise BadInput(f"{path}: has no {name}: incomplete")
+            raise BadInput(path, f"has no {name}: incomplete")
     verify(path)
     try:
         components = Checkpoint.manifest(path)["components"]
     except (CheckpointError, OSError, TypeError, AttributeError, ValueError) as error:
-        raise BadInput(f"{path}: not a checkpoint of deepracer-exp: {_one_line(error)}") from error
+        raise BadInput(path, f"not a checkpoint of deepracer-exp: {_one_line(error)}") from error
     if AGENT not in components or not components.keys() <= {AGENT, TRAINING}:
         held = ", ".join(components) or "nothing"
-        raise BadInput(f"{path}: not a checkpoint of deepracer-exp: holds {held}")
+        raise BadInput(path, f"not a checkpoint of deepracer-exp: holds {held}")
     for name, record in components.items():
         folder = path / record["path"]  # torchrl lets no absolute path and no `..` pass
         there = {file.name for file in folder.iterdir()} if folder.is_dir() else set()
         if record["adapter"] != StateDictCheckpointAdapter.adapter_id or there != _STATE:
             parts = " and ".join(sorted(_STATE))
-            raise BadInput(f"{path}: not a checkpoint of deepracer-exp: {name} is not {parts}")
+            raise BadInput(path, f"not a checkpoint of deepracer-exp: {name} is not {parts}")
         _check_archive(folder / "state.tdz")
     if resumable and TRAINING not in components:
-        raise BadInput(f"{path}: contains only the policy, so a training cannot resume from it")
+        raise BadInput(path, "contains only the policy, so a training cannot resume from it")
     return path
 
 
@@ -156,10 +157,10 @@ def read_policy(experiment: Experiment, path: Path) -> StoredPolicy:
     try:
         networks.load_state_dict(stored.values["networks"])
     except (KeyError, RuntimeError) as error:
-        raise BadInput(f"{path}: {problem}: {_one_line(error)}") from error
+        raise BadInput(path, f"{problem}: {_one_line(error)}") from error
     for key, value in networks.state_dict().items():
         if not torch.isfinite(value).all():
-            raise BadInput(f"{path}: {key} is not finite; choose another checkpoint")
+            raise BadInput(path, f"{key} is not finite; choose another checkpoint")
     return StoredPolicy(networks, path, counters)
 
 
@@ -206,7 +207,7 @@ def _load(path: Path, component: str, target: Any, problem: str) -> dict[str, An
     try:
         return dict(archive.load(path).manifest["metadata"])
     except (CheckpointError, OSError) as error:
-        raise BadInput(f"{path}: {problem}: {_one_line(error)}") from error
+        raise BadInput(path, f"{problem}: {_one_line(error)}") from error
 
 
 def _check_archive(file: Path) -> None:
@@ -217,14 +218,12 @@ def _check_archive(file: Path) -> None:
             foreign = [name for name in archive.namelist() if not _MEMBER.fullmatch(name)]
             unpacked = sum(member.file_size for member in archive.infolist())
     except (zipfile.BadZipFile, OSError, EOFError) as error:
-        raise BadInput(f"{file}: corrupt: {error}") from error
+        raise BadInput(file, f"corrupt: {error}") from error
     if foreign:
-        raise BadInput(f"{file}: contains {foreign[0]}, which is not a tensor; a pickle is never loaded")
+        raise BadInput(file, f"contains {foreign[0]}, which is not a tensor; a pickle is never loaded")
     # Ours are not compressed, and no two tensors share bytes.
     if unpacked > size:
-        raise BadInput(
-            f"{file}: {size:,} bytes that unpack to {unpacked:,}; accepted: tensors that are not compressed"
-        )
+        raise BadInput(file, f"{size:,} bytes that unpack to {unpacked:,}", "tensors that are not compressed")
 
 
 def _one_line(error: Exception) -> str:

@@ -91,7 +91,7 @@ def survey(runs_dir: Path, overview: StoreOverview | None) -> Removables:
         for run in _own_runs(runs_dir):
             _search(run, wanted[run.name], overview, found)
     except OSError as error:
-        raise BadInput(f"{error.filename}: cannot be read: {error.strerror}; nothing is removed") from error
+        raise BadInput(error.filename, f"cannot be read: {error.strerror}; nothing is removed") from error
     return found
 
 
@@ -188,13 +188,13 @@ def deletable(run: Path, runs_dir: Path) -> Removable:
     """
     place = run.resolve()
     if run.is_symlink() or place.parent.parent != runs_dir.resolve() or place.parent.is_symlink():
-        raise BadInput(f"{run}: is not a run's own folder in runs_dir={runs_dir}; nothing was deleted")
+        raise BadInput(run, f"is not a run's own folder in runs_dir={runs_dir}; nothing was deleted")
     wanted = _cloned_from(runs_dir)[place.name] | {
         name: ", ".join(reasons) for name, reasons in pinned(run / CHECKPOINTS).items()
     }
     reasons = [f"checkpoint {name} is {why}" for name, why in sorted(wanted.items())]
     if reason := _in_progress(run) or ", ".join(reasons):
-        raise BadInput(f"{run}: {reason}; nothing was deleted")
+        raise BadInput(run, f"{reason}; nothing was deleted")
     return Removable(run, ASKED, (run,), _size(run))
 
 

@@ -107,7 +107,7 @@ def read_config(path: Path) -> dict[str, Any]:
     file = path / CONFIG
     mapping = read_yaml(file, "what a run writes there")
     if not isinstance(mapping, dict):
-        raise BadInput(f"{file}: holds no values; a run writes its experiment there")
+        raise BadInput(file, "holds no values; a run writes its experiment there")
     return {str(key): value for key, value in mapping.items()}
 
 
@@ -141,7 +141,7 @@ def read_run_id(path: Path) -> str | None:
     """
     run_id = read_object(path / TRACKING).get("run_id")
     if not isinstance(run_id, str | None):
-        raise BadInput(f"{path / TRACKING}: run_id: {run_id!r} is not a string")
+        raise BadInput(path / TRACKING, f"run_id: {run_id!r} is not a string")
     return run_id
 
 
@@ -160,8 +160,8 @@ def _text(path: Path) -> str:
 
 
 def _object(path: Path, text: str, where: str = "") -> dict[str, Any]:
-    with reading(f"{path}{where}: is not valid JSON"):
+    with reading(f"{path}{where}", why="is not valid JSON"):
         value = json.loads(text)
     if not isinstance(value, dict):
-        raise BadInput(f"{path}{where}: {text[:40]!r} is not a JSON object")
+        raise BadInput(f"{path}{where}", f"{text[:40]!r} is not a JSON object")
     return value

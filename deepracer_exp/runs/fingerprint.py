@@ -52,8 +52,9 @@ def refuse_changes(
     changed += [f"{file} has other contents" for file in now if now[file] != before["files"].get(file)]
     if changed:
         raise BadInput(
-            f"{run_dir}: was started with other values: {'; '.join(changed)}; accepted changes: "
-            f"{', '.join(HARMLESS)}; `deepracer-exp clone` makes a new run with others"
+            run_dir,
+            f"was started with other values: {'; '.join(changed)}; accepted changes: {', '.join(HARMLESS)}; "
+            "`deepracer-exp clone` makes a new run with others",
         )
 
 

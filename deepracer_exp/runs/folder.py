@@ -77,8 +77,8 @@ class RunFolder:
             return cls(_make_new(parent, name))
         except OSError as error:
             raise BadInput(
-                f"runs_dir={runs_dir}: cannot create {parent / name}: {error.strerror}; give a folder that can be "
-                "written"
+                f"runs_dir={runs_dir}",
+                f"cannot create {parent / name}: {error.strerror}; give a folder that can be written",
             ) from error
 
     def describe(
@@ -203,7 +203,7 @@ def _locked(file: Path) -> FileLock:
     try:
         lock.acquire()
     except Timeout:
-        raise BadInput(f"{file.parent}: a process is training in it; end that one first") from None
+        raise BadInput(file.parent, "a process is training in it; end that one first") from None
     return lock
 
 

@@ -59,7 +59,7 @@ def check_label(what: str, text: str) -> str:
         BadInput: it is longer than MLflow and a table can take, or has control characters.
     """
     if len(text) > _LONGEST or not all(letter.isprintable() for letter in text):
-        raise BadInput(f"{what}: accepted: one line of at most {_LONGEST:,} characters")
+        raise BadInput(what, "", f"one line of at most {_LONGEST:,} characters")
     return text
 
 
@@ -71,7 +71,7 @@ def check_tag(word: str) -> tuple[str, str]:
     """
     key, equals, value = word.partition("=")
     if not equals or not _KEY.fullmatch(key):
-        raise BadInput(f"{word}: accepted: KEY=VALUE, where KEY has letters, digits, '_', '.' and '-'")
+        raise BadInput(word, "", "KEY=VALUE, where KEY has letters, digits, '_', '.' and '-'")
     return key, check_label(word[:60], value)
 
 

@@ -65,25 +65,26 @@ def refuse_other_networks(parent: Experiment, clone: Experiment) -> None:
         changed = "; ".join(
             describe_differences(config_differences([vars(parent.network), vars(clone.network)]))
         )
-        raise BadInput(f"network: cannot be changed in a clone: {changed}; {why}")
+        raise BadInput("network", f"cannot be changed in a clone: {changed}; {why}")
     before, after = (
         {name: sensor and vars(sensor) for name, sensor in (("camera", seen.camera), ("lidar", seen.lidar))}
         for seen in (parent.observation, clone.observation)
     )
     if before != after:
         changed = "; ".join(describe_differences(config_differences([before, after])))
-        raise BadInput(f"observation: cannot be changed in a clone: {changed}; {why}")
+        raise BadInput("observation", f"cannot be changed in a clone: {changed}; {why}")
     if clone.observation != parent.observation:
         from deepracer_exp.env.observation import feature_names  # imports MuJoCo
 
         ours, theirs = feature_names(clone.observation), feature_names(parent.observation)
         odd = ", ".join(sorted(set(ours) ^ set(theirs))) or "the order, or what is looked ahead"
         raise BadInput(
-            f"observation: cannot be changed in a clone: {len(theirs)} -> {len(ours)} features ({odd}); {why}"
+            "observation",
+            f"cannot be changed in a clone: {len(theirs)} -> {len(ours)} features ({odd}); {why}",
         )
     acted, acts = (describe_actions(build_action_space(one.action_space)) for one in (parent, clone))
     if acted != acts:
-        raise BadInput(f"action_space: cannot be changed in a clone: {acted} -> {acts}; {why}")
+        raise BadInput("action_space", f"cannot be changed in a clone: {acted} -> {acts}; {why}")
 
 
 @dataclass
@@ -142,7 +143,7 @@ def family(run: Path, runs_dir: Path) -> Member:
     while (parent := parent_of(root)) is not None:
         seen.add(root)
         if parent in seen:
-            raise BadInput(f"{root / LINEAGE}: {root.name} descends from itself; nothing can be shown")
+            raise BadInput(root / LINEAGE, f"{root.name} descends from itself; nothing can be shown")
         root = parent
     return _grow(root, children, lineages)
 

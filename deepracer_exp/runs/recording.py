@@ -85,8 +85,9 @@ def read_log(path: Path) -> Recording | RunRecording:
     """
     if is_run(path) and not (path / TRACE).is_dir():
         raise BadInput(
-            f"{path}: has no trace: `deepracer-exp runs clean` removed it, or the run never drove; accepted: a run "
-            "with its trace, or logs of the service"
+            path,
+            "has no trace: `deepracer-exp runs clean` removed it, or the run never drove",
+            "a run with its trace, or logs of the service",
         )
     return read_run_recording(path) if is_traced_run(path) else read_recording(path)
 
@@ -176,7 +177,7 @@ def _config(folder: Path, problems: list[LogProblem], files: list[Path]) -> Mapp
     try:
         config = read_config(file.parent)
     except BadInput as error:
-        problems.append(LogProblem(str(file), None, str(error).removeprefix(f"{file}: ")))
+        problems.append(LogProblem(str(file), None, error.without(file)))
         return {}
     files.append(file)
     return config
@@ -224,7 +225,7 @@ def _best(folder: Path, problems: list[LogProblem]) -> RunResult:
         found = read_result(folder)
     except BadInput as error:
         file = folder / SUMMARY
-        problems.append(LogProblem(str(file), None, str(error).removeprefix(f"{file}: ")))
+        problems.append(LogProblem(str(file), None, error.without(file)))
         found = None
     return found or RunResult(measure=IN_TRAINING, rank=(0.0, -math.inf), completion=None, lap_time_s=None)
 

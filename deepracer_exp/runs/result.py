@@ -148,7 +148,7 @@ def read_result(run: Path) -> RunResult | None:
     try:
         return result_of(summary)
     except (TypeError, ValueError, KeyError, AttributeError) as error:
-        raise BadInput(f"{file}: is not what a training writes: {error!r}") from error
+        raise BadInput(file, f"is not what a training writes: {error!r}") from error
 
 
 def result_of(summary: Mapping[str, Any]) -> RunResult | None:

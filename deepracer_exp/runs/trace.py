@@ -64,7 +64,7 @@ def trace_files(folder: Path) -> list[Path]:
     """
     found = sorted(path for path in folder.glob(f"*{_ENDING}") if not path.name.startswith("."))
     if not found:
-        raise BadInput(f"{folder}: no *{_ENDING}; accepted: the folder of a run with its trace")
+        raise BadInput(folder, f"no *{_ENDING}", "the folder of a run with its trace")
     return found
 
 
@@ -91,7 +91,5 @@ def read_trace(folder: Path, columns: Sequence[str] = TRACE_COLUMNS) -> "pd.Data
             tables.append(pq.read_table(path, columns=list(columns)).cast(schema))
         except (OSError, pa.ArrowInvalid, ValueError) as error:
             reason = " ".join(str(error).split())
-            raise BadInput(
-                f"{path}: not a trace ({reason}); accepted: a complete Parquet file of a run"
-            ) from error
+            raise BadInput(path, f"not a trace ({reason})", "a complete Parquet file of a run") from error
     return pa.concat_tables(tables).to_pandas()

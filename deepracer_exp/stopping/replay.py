@@ -66,7 +66,7 @@ def replay(record: RunRecord, config: StoppingConfig, rule: str) -> Replay:
     """
     rows = record.rows
     if not rows:
-        raise BadInput(f"{record.path / METRICS}: has no iteration; nothing to apply a rule to")
+        raise BadInput(record.path / METRICS, "has no iteration; nothing to apply a rule to")
     if isinstance(config, ReliableStopping):
         _check_episodes(record, config)
     stopping = build_rule(config, action_count(record))
@@ -157,7 +157,7 @@ def action_count(record: RunRecord) -> int | None:
         adapter: TypeAdapter[ActionSpaceConfig] = TypeAdapter(ActionSpaceConfig)
         space = adapter.validate_python(record.config.get("action_space"))
     except ValidationError as error:
-        raise BadInput(f"{record.path / CONFIG}: action_space: {error.errors()[0]['msg'].lower()}") from error
+        raise BadInput(record.path / CONFIG, f"action_space: {error.errors()[0]['msg'].lower()}") from error
     return build_action_space(space).n
 
 

@@ -38,7 +38,8 @@ def deliver(run_dir: Path, uri: str | None, runs_dir: Path) -> int:
     summary = read_object(run_dir / SUMMARY)
     if not summary:
         raise BadInput(
-            f"{run_dir}: has no summary.json, so the run has not ended; only ended runs can be recorded afterwards"
+            run_dir,
+            "has no summary.json, so the run has not ended; only ended runs can be recorded afterwards",
         )
     store = resolve_store(uri, runs_dir)
     file = TrackingFile(run_dir, read_tracked_run(run_dir / TRACKING), store.shown)
@@ -53,7 +54,7 @@ def deliver(run_dir: Path, uri: str | None, runs_dir: Path) -> int:
             f" {error}"
         ) from error
     for what, reason in refused.items():
-        raise BadInput(f"{run_dir}: MLflow ({store.shown}) refused {what}: {reason}")
+        raise BadInput(run_dir, f"MLflow ({store.shown}) refused {what}: {reason}")
     file.change(complete=True)
     return projection.written
 
@@ -156,7 +157,7 @@ def marked_deleted(run_dir: Path, run_id: str, uri: str | None, runs_dir: Path) 
     recorded = read_tracked_run(run_dir / TRACKING).store
     if not resolve_store(uri, runs_dir).is_named(recorded):
         raise BadInput(
-            f"{run_dir}: was recorded in {recorded}; give tracking.uri={recorded} to delete it there"
+            run_dir, f"was recorded in {recorded}; give tracking.uri={recorded} to delete it there"
         )
     if not has_store(uri, runs_dir):
         yield

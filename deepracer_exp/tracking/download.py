@@ -69,9 +69,7 @@ def download(what: str, wanted: Download, store: Store, target: Path) -> None:
         checkpoint = aside / CHECKPOINTS / wanted.checkpoint
         verify(checkpoint)
         if checkpoint_sha256(checkpoint) != wanted.sha256:
-            raise BadInput(
-                f"{what}: its files are not those of the registered checkpoint: their hash differs"
-            )
+            raise BadInput(what, "its files are not those of the registered checkpoint: their hash differs")
         with writing(target):
             if target.exists():
                 place = target / CHECKPOINTS / wanted.checkpoint
@@ -92,10 +90,10 @@ def _run(what: str, wanted: Download, folder: Path) -> None:
         try:
             _, said = process.communicate(json.dumps(wanted.__dict__).encode(), _LONGEST_S)
         except subprocess.TimeoutExpired:
-            raise BadInput(f"{what}: the download took more than {_LONGEST_S:.0f} s") from None
+            raise BadInput(what, f"the download took more than {_LONGEST_S:.0f} s") from None
     if process.returncode:
         lines = said.decode(errors="replace").strip().splitlines() or ["the download ended"]
-        raise BadInput(f"{what}: {lines[-1]}")
+        raise BadInput(what, lines[-1])
 
 
 def _fetch(wanted: Download, folder: Path) -> None:
@@ -114,7 +112,7 @@ def _fetch(wanted: Download, folder: Path) -> None:
     model = client.get_logged_model(wanted.model_id)
     files = _files_of(model.artifact_location, wanted.uri)
     _fetch_file(files, f"{_CHECKPOINT}/{HASHES}", folder, wanted.most_bytes)
-    with reading(f"{HASHES}: is not valid JSON"):
+    with reading(HASHES, why="is not valid JSON"):
         hashes = json.loads((folder / _CHECKPOINT / HASHES).read_text(encoding="utf-8"))
     for name in _checked_names(hashes):
         _fetch_file(files, f"{_CHECKPOINT}/{name}", folder, wanted.most_bytes)

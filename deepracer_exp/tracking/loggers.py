@@ -36,7 +36,7 @@ class TensorBoardTracker(Tracker):
             self._logger = get_logger(TENSORBOARD, logger_name=str(folder), experiment_name=TENSORBOARD)
         except OSError as error:
             raise BadInput(
-                f"tracking=tensorboard: {folder / TENSORBOARD}: cannot be written: {error.strerror}"
+                "tracking=tensorboard", f"{folder / TENSORBOARD}: cannot be written: {error.strerror}"
             ) from error
         rows = "\n".join(f"| {key} | {value} |" for key, value in run.params.items())
         self._logger.experiment.add_text("parameters", f"| key | value |\n|---|---|\n{rows}")
@@ -100,8 +100,9 @@ class WandbTracker(Tracker):
         except (wandb.Error, OSError) as error:
             reason = " ".join(str(error).split())[:300]
             raise BadInput(
-                f"tracking=wandb: {reason}; accepted: a machine that is logged in (`wandb login`), or "
-                "tracking.mode=offline"
+                "tracking=wandb",
+                reason,
+                "a machine that is logged in (`wandb login`), or tracking.mode=offline",
             ) from error
         self._first_step = self._logger.experiment.step
         self._logger.log_hparams({**run.params, "tags": run.tags})

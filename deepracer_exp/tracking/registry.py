@@ -65,8 +65,10 @@ def check_alias(what: str, alias: str) -> None:
     """Refuse an invalid alias; `what` begins the message."""
     if not is_alias(alias):
         raise BadInput(
-            f"{what}: {alias!r} is not an alias; accepted: a letter, then letters, digits, '_' and '-', at most 80; "
-            "not latest and not v1, v2, ..., which MLflow reserves"
+            what,
+            f"{alias!r} is not an alias",
+            "a letter, then letters, digits, '_' and '-', at most 80; not latest and not v1, v2, ..., which MLflow "
+            "reserves",
         )
 
 
@@ -75,7 +77,7 @@ def check_model(what: str, model: str) -> None:
     try:
         safe_name(model)
     except ValueError as error:
-        raise BadInput(f"{what}: {model!r} is not a model name: {error}") from None
+        raise BadInput(what, f"{model!r} is not a model name: {error}") from None
 
 
 def look_up(reference: str, uri: str | None, runs_dir: Path) -> Registered:
@@ -96,11 +98,13 @@ def look_up(reference: str, uri: str | None, runs_dir: Path) -> Registered:
     names = [f"{name}@{given}" for name, given in matches or known]
     if matches:
         raise BadInput(
-            f"{reference}: ambiguous: {len(matches)} models have this alias: {', '.join(names[:5])}; give MODEL@ALIAS"
+            reference,
+            f"ambiguous: {len(matches)} models have this alias: {', '.join(names[:5])}; give MODEL@ALIAS",
         )
     raise BadInput(
-        f"{reference}: no registered model has this alias{nearest(reference, names)}; "
-        f"known: {', '.join(names[:10]) or 'none'}; deepracer-exp runs promote registers one"
+        reference,
+        f"no registered model has this alias{nearest(reference, names)}; known: {', '.join(names[:10]) or 'none'}; "
+        "deepracer-exp runs promote registers one",
     )
 
 
@@ -151,14 +155,15 @@ def promote(
     run_id = read_run_id(run)
     if run_id is None:
         raise BadInput(
-            f"{run}: is not recorded in MLflow (another tracking=, or the store was down), so it cannot be registered"
+            run,
+            "is not recorded in MLflow (another tracking=, or the store was down), so it cannot be registered",
         )
     tags = {_RUN_DIR: str(run.resolve()), _CHECKPOINT: folder.name, _SHA256: checkpoint_sha256(folder)}
     what = f"promote {run.name}"
     with open_client(what, uri, runs_dir) as client:
         recorded = client.get_run(run_id).info
         if recorded.lifecycle_stage != "active":
-            raise BadInput(f"{what}: was deleted in MLflow (run {run_id}); restore it there")
+            raise BadInput(what, f"was deleted in MLflow (run {run_id}); restore it there")
         pin(run / CHECKPOINTS, folder.name, f"registered as {model}")
         if not any(found.name == model for found in pages(client.search_registered_models)):
             client.create_registered_model(
@@ -279,7 +284,8 @@ def _registered(what: str, version: Any, alias: str) -> Registered:
     run_dir, checkpoint, sha256 = (version.tags.get(key) for key in (_RUN_DIR, _CHECKPOINT, _SHA256))
     if not run_dir or not sha256 or not re.fullmatch(r"\d{6,9}", checkpoint or ""):
         raise BadInput(
-            f"{what}: version {version.version} of {version.name} was not registered by deepracer-exp runs promote"
+            what,
+            f"version {version.version} of {version.name} was not registered by deepracer-exp runs promote",
         )
     model_id = str(version.source).removeprefix("models:/")
     return Registered(
@@ -295,7 +301,7 @@ def download_folder(run_dir: Path, runs_dir: Path) -> Path:
     """
     for name in (run_dir.parent.name, run_dir.name):
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name):
-            raise BadInput(f"{run_dir}: {name!r} is not the name of a run or an experiment")
+            raise BadInput(run_dir, f"{name!r} is not the name of a run or an experiment")
     return runs_dir / run_dir.parent.name / run_dir.name
 
 

@@ -123,8 +123,9 @@ def resolve_store(uri: str | None, runs_dir: Path) -> Store:
     known = (*_DATABASES, *_SERVERS)
     if not colon or base not in known:
         raise BadInput(
-            f"{shown}: not a store that MLflow can record in{nearest(base, known)};"
-            f" accepted: http(s)://host:port, {_SQLITE_PREFIX}/path/mlflow.db, postgresql://, mysql://, mssql://"
+            shown,
+            f"not a store that MLflow can record in{nearest(base, known)}",
+            f"http(s)://host:port, {_SQLITE_PREFIX}/path/mlflow.db, postgresql://, mysql://, mssql://",
         )
     if base == "sqlite":
         return Store(_check_sqlite_uri(uri, shown), artifacts)
@@ -132,10 +133,10 @@ def resolve_store(uri: str | None, runs_dir: Path) -> Store:
         parts = urlsplit(uri)
         host, _ = parts.hostname, parts.port
     except ValueError:  # which may quote a piece of the password
-        raise BadInput(f"{shown}: no host and port can be read; accepted: {scheme}://host:port/...") from None
+        raise BadInput(shown, "no host and port can be read", f"{scheme}://host:port/...") from None
     # A database may be reached through a local socket, named by parameters instead of a host.
     if base in _SERVERS and not host:
-        raise BadInput(f"{shown}: no host; accepted: {scheme}://host:port")
+        raise BadInput(shown, "no host", f"{scheme}://host:port")
     if base not in _SERVERS:
         return Store(uri, artifacts)
     user, password = (value and unquote(value) for value in (parts.username, parts.password))
@@ -145,7 +146,7 @@ def resolve_store(uri: str | None, runs_dir: Path) -> Store:
 def _check_sqlite_uri(uri: str, shown: str) -> str:
     path = uri.removeprefix(_SQLITE_PREFIX)
     if not uri.startswith(_SQLITE_PREFIX) or not path or path.startswith((":", "file:")):
-        raise BadInput(f"{shown}: names no file; accepted: {_SQLITE_PREFIX}/path/mlflow.db")
+        raise BadInput(shown, "names no file", f"{_SQLITE_PREFIX}/path/mlflow.db")
     # The UI's server has another working folder than the training may have had.
     file = Path(path).absolute()
     _check_sqlite_file(file, shown)
@@ -155,7 +156,7 @@ def _check_sqlite_uri(uri: str, shown: str) -> str:
 def _check_sqlite_file(file: Path, shown: str) -> None:
     # SQLAlchemy splits the uri at the first "?" and does not unquote the path, so no escape exists.
     if "?" in str(file):
-        raise BadInput(f"{shown}: MLflow's SQLite store cannot be at a path with '?' ({file}); rename it")
+        raise BadInput(shown, f"MLflow's SQLite store cannot be at a path with '?' ({file}); rename it")
     check_database_file(file, shown)
 
 
@@ -164,9 +165,9 @@ def check_database_file(file: Path, shown: str) -> None:
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise BadInput(f"{shown}: folder {file.parent} cannot be created: {error.strerror}") from None
+        raise BadInput(shown, f"folder {file.parent} cannot be created: {error.strerror}") from None
     if file.is_dir():
-        raise BadInput(f"{shown}: {file} is a folder; a file name is needed")
+        raise BadInput(shown, f"{file} is a folder; a file name is needed")
     try:
         # SQLite keeps two files beside it. Permissions alone do not decide it: root has all of them, even in /proc.
         tempfile.TemporaryFile(dir=file.parent).close()
@@ -174,7 +175,7 @@ def check_database_file(file: Path, shown: str) -> None:
     except OSError:
         writable = False
     if not writable:
-        raise BadInput(f"{shown}: {file} cannot be written; choose a writable place")
+        raise BadInput(shown, f"{file} cannot be written; choose a writable place")
 
 
 def silence_mlflow() -> None:
@@ -231,12 +232,12 @@ def existing_store(uri: str | None, runs_dir: Path) -> Store:
     default = runs_dir / MLFLOW_DB
     if uri is None and not default.exists():
         raise BadInput(
-            f"{default}: no runs recorded yet; run `deepracer-exp train` first, or give tracking.uri="
+            default, "no runs recorded yet; run `deepracer-exp train` first, or give tracking.uri="
         )
     # Before `resolve_store`, which creates the file's folder.
     path = (uri or "").removeprefix(_SQLITE_PREFIX)
     if uri is not None and uri.startswith(_SQLITE_PREFIX) and path and not Path(path).exists():
-        raise BadInput(f"tracking.uri={uri}: no such file; train with this tracking.uri first")
+        raise BadInput(f"tracking.uri={uri}", "no such file; train with this tracking.uri first")
     return resolve_store(uri, runs_dir)
 
 
@@ -254,7 +255,7 @@ def open_client(
     """
     if not has_store(uri, runs_dir):
         raise BadInput(
-            f"{what}: {runs_dir} has no mlflow.db to look it up in; give tracking.uri=URI or a run's folder"
+            what, f"{runs_dir} has no mlflow.db to look it up in; give tracking.uri=URI or a run's folder"
         )
     store = existing_store(uri, runs_dir)
     try:
@@ -262,4 +263,4 @@ def open_client(
         with store_errors():
             yield client_of(store, total_s or calls.LOOKUP_S)
     except (StoreRefusedError, StoreUnavailableError) as error:
-        raise BadInput(f"{what}: MLflow ({store.shown}): {error}") from error
+        raise BadInput(what, f"MLflow ({store.shown}): {error}") from error

@@ -79,7 +79,7 @@ def read_tracked_run(path: Path) -> TrackedRun:
     """
     run = read_json_as(path, _TRACKED_RUN, "a tracker")
     if run is None:
-        raise BadInput(f"{path}: is missing: the run was not recorded in MLflow, or the file was removed")
+        raise BadInput(path, "is missing: the run was not recorded in MLflow, or the file was removed")
     return run
 
 

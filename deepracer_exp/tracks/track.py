@@ -172,7 +172,7 @@ class Track:
             with _naming(path):
                 rows = rows_from_knots(course.knots, course.width_m, course.closed)
         else:
-            raise BadInput(f"{path}: ending {path.suffix!r}; accepted: .npy (route) and .yaml (knots)")
+            raise BadInput(path, f"ending {path.suffix!r}", ".npy (route) and .yaml (knots)")
         with _naming(path):
             return cls.from_route(rows, path.stem, title=title, reversed=reversed, floor=floor)
 
@@ -328,7 +328,7 @@ def _naming(source: object) -> Iterator[None]:
     try:
         yield
     except BadInput as error:
-        raise BadInput(f"{source}: {error}") from None
+        raise BadInput(source, error) from None
 
 
 def _frozen(array: np.ndarray) -> np.ndarray:

@@ -163,7 +163,7 @@ def refuse_ended(run_dir: Path, config: BudgetConfig, overrides: Sequence[str]) 
     used = Budget(config, run_dir).used(summary["env_steps"], summary["iteration"], summary["wall_clock_s"])
     if used[1] >= 1:
         raise RunEnded(
-            f"{run_dir}: has ended ({reason}); to resume it, give it more, such as budget.{used[0]}="
+            run_dir, f"has ended ({reason}); to resume it, give it more, such as budget.{used[0]}="
         )
 
 
@@ -230,7 +230,7 @@ def _command(config: BudgetConfig) -> tuple[str, ...] | None:
         return tuple(shlex.split(config.alert_command))
     except ValueError as error:
         raise BadInput(
-            f"budget.alert_command={config.alert_command}: {error}; accepted: a program and its arguments"
+            f"budget.alert_command={config.alert_command}", error, "a program and its arguments"
         ) from error
 
 

@@ -17,6 +17,7 @@ from deepracer_exp.config.custom_files import (
     KEY,
     PLACES,
     CustomFiles,
+    car_override,
     network_overrides,
     read_custom_files,
     sensor_overrides,
@@ -35,10 +36,8 @@ from deepracer_exp.rewards.source import load_reward_source
 from .run import store_run
 
 _CHECKPOINT = "checkpoint="
-_CHOSEN_HERE = tuple(f"model_metadata.json: {key}" for key in ("sensor", "neural_network", "lidar_config"))
-"""Remarks on keys that have no effect where only options are made of the files."""
-_SETTINGS = ("training_params.yaml: ", "model_metadata.json: version=")
-"""How remarks on track, starts and car begin."""
+_CHOSEN_HERE = ("sensor", "neural_network", "lidar_config")
+"""Keys of model_metadata.json that have no effect where only options are made of the files."""
 
 
 @dataclass(frozen=True)
@@ -68,9 +67,7 @@ def import_model(path: str, name: str, overrides: Sequence[str]) -> Imported:
     changes = [one for one in overrides if not one.startswith(_CHECKPOINT)]
     wanted = given[-1] if given else "best"
     if wanted not in ("best", "last"):
-        raise BadInput(
-            f"checkpoint={wanted}: accepted: best, last (of the service's deepracer_checkpoints.json)"
-        )
+        raise BadInput(f"checkpoint={wanted}", "", "best, last (of the service's deepracer_checkpoints.json)")
     model = read_model(path, wanted)
     with tempfile.TemporaryDirectory() as aside:
         for file in PLACES:
@@ -95,8 +92,8 @@ def _import(model: StoredModel, path: str, aside: str, name: str, changes: Seque
     own = {key_of(line): line for line in changes}
     options = import_files(files, name, composition.mapping, [*network, *seen], path, own)
     # No option file can choose several tracks, so that the experiment has none of them.
-    several = several_of(job_overrides(files.workers, own)[0])
-    applied = [note for note in composition.notes if note.startswith(_SETTINGS)]
+    job, of_job = job_overrides(files.workers, own)
+    several, applied = several_of(job), [*car_override(files, own)[1], *of_job]
     try:
         experiment, composition = compose_experiment([f"experiment={name}", *several, *changes])
         result = store_run(experiment, composition, networks, f"imported from {model.source}")
@@ -122,7 +119,7 @@ def _fit(
         lines = [override_line(KEY, files.folder), *seen, *network, override_line("name", name), *changes]
         experiment, composition = compose_experiment(lines)
         if not isinstance(experiment.network, CNNConfig):
-            raise BadInput("network: the weights are of a network of the service; leave network= off")
+            raise BadInput("network", "the weights are of a network of the service; leave network= off")
         shapes = observation_shape(experiment.observation), build_action_space(experiment.action_space).n
         try:
             with torch.device("meta"):  # shapes only: the weights of a model may take gigabytes
@@ -169,7 +166,7 @@ def _remarks(files: CustomFiles, model: StoredModel, absent: Sequence[str]) -> l
         notes.append(
             "a frozen graph holds no standard deviation of the actions: it starts at network.initial_std"
         )
-    notes += [one for one in files.remarks() if not one.startswith(_CHOSEN_HERE)]
+    notes += files.remarks(besides=_CHOSEN_HERE)
     if "reward_function.py" not in model.files:
         notes.append(
             "reward_function.py: not among the files; clones learn from the default reward unless given reward="

@@ -188,7 +188,7 @@ def _try(experiment: Experiment, setup: RaceSetup) -> None:
     if experiment.device != "cpu" and (torch.device(experiment.device).index or 0) >= gpus:
         names = ["cpu", *(f"cuda:{number}" for number in range(gpus))]
         raise BadInput(
-            f"device={experiment.device}: PyTorch finds {count(gpus, 'GPU')} here; accepted: {', '.join(names)}"
+            f"device={experiment.device}", f"PyTorch finds {count(gpus, 'GPU')} here", ", ".join(names)
         )
 
 
@@ -256,7 +256,7 @@ def _begin(
         what = (
             f"cannot write {error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error)
         )
-        raise BadInput(f"runs_dir={experiment.runs_dir}: {what}; give a folder with room") from error
+        raise BadInput(f"runs_dir={experiment.runs_dir}", f"{what}; give a folder with room") from error
     except BaseException as error:
         folder.remove()
         if isinstance(error, Exception) and (reason := _own_error(error, experiment)):

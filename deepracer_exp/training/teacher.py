@@ -30,19 +30,17 @@ def find_teacher(experiment: Experiment) -> StoredRun | None:
         describe_actions(build_action_space(one.action_space)) for one in (run.experiment, experiment)
     )
     if theirs != ours:
-        raise BadInput(f"{what}: has other actions: {theirs}; accepted: a run with {ours}")
+        raise BadInput(what, f"has other actions: {theirs}", f"a run with {ours}")
     before, now = run.experiment.observation, experiment.observation
     sees = stored.networks.policy.in_keys
     for key, sensor in (("pixels", "camera"), ("lidar", "lidar")):
         if key in sees and getattr(before, sensor) != getattr(now, sensor):
             raise BadInput(
-                f"{what}: sees other {key}; accepted: a run with the same {sensor}, or observation=features"
+                what, f"sees other {key}", f"a run with the same {sensor}, or observation=features"
             )
     features = [replace(one, camera=None, lidar=None) for one in (before, now)]
     if "observation" in sees and features[0] != features[1]:
-        raise BadInput(
-            f"{what}: sees other features; accepted: a run whose features are those of this observation"
-        )
+        raise BadInput(what, "sees other features", "a run whose features are those of this observation")
     return StoredRun(run.path, stored.path.name)
 
 
@@ -68,6 +66,6 @@ def read_teacher(folder: Path) -> TensorDictModuleBase:
         (checkpoint,) = kept.checkpoints.iterdir()
     except (OSError, ValueError) as error:
         raise BadInput(
-            f"{kept.checkpoints}: is not one checkpoint, which a run with a teacher has there"
+            kept.checkpoints, "is not one checkpoint, which a run with a teacher has there"
         ) from error
     return read_policy(kept.experiment, check(checkpoint)).networks.policy

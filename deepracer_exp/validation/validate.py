@@ -127,9 +127,7 @@ def read(experiment: Experiment) -> Check:
     """
     if len(experiment.tracks) > 1:
         names = ", ".join(experiment.tracks)
-        raise BadInput(
-            f"track=[{names}]: a reward function is validated on one track; accepted: one of these"
-        )
+        raise BadInput(f"track=[{names}]", "a reward function is validated on one track", "one of these")
     setup = build_setup(experiment)
     (track,) = experiment.tracks.values()
     # A track driven in both directions is checked in the first of them.

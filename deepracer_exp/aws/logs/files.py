@@ -169,9 +169,7 @@ def log_folder(path: Path) -> Iterator[LogFolder]:
     try:
         mode = path.stat().st_mode
         if not (stat.S_ISDIR(mode) or stat.S_ISREG(mode)):
-            raise BadInput(
-                f"{path}: is neither a file nor a folder; accepted: logs of the service or a run's folder"
-            )
+            raise BadInput(path, "is neither a file nor a folder", "logs of the service or a run's folder")
         with contextlib.ExitStack() as opened:
             if stat.S_ISDIR(mode):
                 yield _walk(path, opened)
@@ -183,11 +181,11 @@ def log_folder(path: Path) -> Iterator[LogFolder]:
             else:
                 yield LogFolder([_plain(path, named_parts(path)[-3:])])
     except FileNotFoundError as error:
-        raise BadInput(f"{path}: no such file or folder; accepted: {_ACCEPTED}") from error
+        raise BadInput(path, "no such file or folder", _ACCEPTED) from error
     except (*READ_ERRORS, ValueError) as error:
         if isinstance(error, BadInput):
             raise
-        raise BadInput(f"{path}: cannot be read: {reason_of(error)}") from error
+        raise BadInput(path, f"cannot be read: {reason_of(error)}") from error
 
 
 def _walk(root: Path, opened: contextlib.ExitStack) -> LogFolder:

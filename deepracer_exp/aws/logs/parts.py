@@ -104,12 +104,12 @@ def read_parts(folder: LogFolder) -> Parts:
         listed = len(parts.problems)
         try:
             known = _read(parts, file, alone)
-        except (ValueError, *READ_ERRORS) as error:  # BadInput is a ValueError
+        except (ValueError, *READ_ERRORS) as error:
             known = False
-            reason = reason_of(error)
+            reason = error.without(file.path) if isinstance(error, BadInput) else reason_of(error)
             if isinstance(error, READ_ERRORS):
                 reason = f"cannot be read ({reason})"
-            parts.problems.append(LogProblem(str(file.path), None, reason.removeprefix(f"{file.path}: ")))
+            parts.problems.append(LogProblem(str(file.path), None, reason))
         parts.drop_first_steps()
         if known:
             parts.files.append(file)
@@ -161,7 +161,7 @@ def _read_csv(parts: Parts, file: LogFile) -> bool:
         try:
             steps, refused = read_trace_csv(stream)
         except ValueError as error:
-            reason = str(error)
+            reason, is_empty = str(error), not file.head(SETTINGS_BYTES).strip()
         else:
             found = _NUMBER.search(file.name)
             number, place = int(found[1]) if found else None, place_of(file.parts)
@@ -170,9 +170,9 @@ def _read_csv(parts: Parts, file: LogFile) -> bool:
             parts.refuse(file, refused)
             return True
     # CloudWatch exports logs as CSV too.
-    if reason != "empty" and _read_log(parts, file):
+    if not is_empty and _read_log(parts, file):
         return True
-    raise BadInput(f"{reason}; accepted: a trace of the service")
+    raise BadInput(reason, accepted="a trace of the service")
 
 
 def _read_log(parts: Parts, file: LogFile) -> bool:
@@ -182,7 +182,7 @@ def _read_log(parts: Parts, file: LogFile) -> bool:
     for log in logs:
         parts.refuse(file, log.refused)
         if not log.recognised and not log.refused:
-            raise BadInput(f"no {MARKER.decode()} line and no policy update; accepted: a log of the service")
+            raise BadInput(f"no {MARKER.decode()} line and no policy update", accepted="a log of the service")
         parts.logs.append((file, log))
         parts.add_steps(file, place_of((*file.parts[:-1], name)), False, age, log.steps)
     log = logs[0]  # all workers print the same settings
@@ -191,7 +191,7 @@ def _read_log(parts: Parts, file: LogFile) -> bool:
             raw = json.dumps(log.metadata).encode()
             parts.metadata.append((file, read_model_metadata(file.path, raw)))
         except BadInput as error:
-            parts.refuse(file, [(None, f"action space: {str(error).removeprefix(f'{file.path}: ')}")])
+            parts.refuse(file, [(None, f"action space: {error.without(file.path)}")])
     if log.hyperparameters is not None:
         _read_hyperparameters(parts, file, json.dumps(log.hyperparameters).encode())
     return True

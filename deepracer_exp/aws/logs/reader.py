@@ -73,7 +73,7 @@ def read_recording(path: Path) -> Recording:
     recording = _Assembly(parts).recording(readable(name))
     if not (len(recording.steps) or len(recording.updates) or len(recording.metrics)):
         why = f" ({recording.problems[0]})" if recording.problems else ""
-        raise BadInput(f"{path}: no recorded steps{why}; accepted: trace CSVs or logs of the service")
+        raise BadInput(path, f"no recorded steps{why}", "trace CSVs or logs of the service")
     return recording
 
 

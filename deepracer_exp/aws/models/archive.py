@@ -84,11 +84,11 @@ class _Files:
     def add(self, name: str, size: int) -> None:
         parts = PurePosixPath(name.replace("\\", "/"))
         if parts.is_absolute() or ".." in parts.parts or re.match(r"[A-Za-z]:", name):
-            raise BadInput(f"{self.path}: {name}: leads out of the archive; accepted: {_ACCEPTED}")
+            raise BadInput(self.path, f"{name}: leads out of the archive", _ACCEPTED)
         self._total += size
         if len(self.sizes) >= _MOST_FILES or self._total > self._most_bytes:
             raise BadInput(
-                f"{self.path}: holds more than {_MOST_FILES:,} files or {LOG_BYTES // 2**30} GiB; accepted: {_ACCEPTED}"
+                self.path, f"holds more than {_MOST_FILES:,} files or {LOG_BYTES // 2**30} GiB", _ACCEPTED
             )
         self.sizes[parts.as_posix()] = size
         self._given[parts.as_posix()] = name
@@ -101,11 +101,11 @@ class _Files:
         """
         size, where = self.sizes[name], f"{self.path}/{name}"
         if size > most_bytes:
-            raise BadInput(f"{where}: has {size:,} bytes; such a file of a model has at most {most_bytes:,}")
+            raise BadInput(where, f"has {size:,} bytes; such a file of a model has at most {most_bytes:,}")
         with self._open(self._given[name]) as file:
             raw = file.read(size + 1)
         if len(raw) != size:
-            raise BadInput(f"{where}: has {len(raw):,} bytes and not {size:,}; copy it again")
+            raise BadInput(where, f"has {len(raw):,} bytes and not {size:,}; copy it again")
         return raw
 
 
@@ -126,7 +126,7 @@ def read_model(path: str, checkpoint: str) -> StoredModel:
         raise
     except (*READ_ERRORS, ValueError) as error:
         reason = getattr(error, "strerror", None) or reason_of(error)
-        raise BadInput(f"{path}: cannot be read: {reason}; accepted: {_ACCEPTED}") from error
+        raise BadInput(path, f"cannot be read: {reason}", _ACCEPTED) from error
 
 
 def _read(files: _Files, checkpoint: str) -> StoredModel:
@@ -137,7 +137,7 @@ def _read(files: _Files, checkpoint: str) -> StoredModel:
     graphs = [name for name in weights if name.endswith(".pb")]
     if not whole and not graphs:
         lacking = f": {min(weights)} has no {DATA} beside it" if weights else ""
-        raise BadInput(f"{files.path}: holds no model{lacking}; accepted: {_ACCEPTED}")
+        raise BadInput(files.path, f"holds no model{lacking}", _ACCEPTED)
     chosen, note = _choose(files, whole or graphs, checkpoint)
     where = f"{files.path}/{chosen}"
     tensors: Tensors
@@ -163,8 +163,9 @@ def _choose(files: _Files, weights: list[str], checkpoint: str) -> tuple[str, st
     folders = {str(PurePosixPath(name).parent) for name in weights}
     if len(folders) > 1:
         raise BadInput(
-            f"{files.path}: holds models in {len(folders)} folders: {', '.join(sorted(folders)[:4])}; accepted: "
-            "the path of one of them"
+            files.path,
+            f"holds models in {len(folders)} folders: {', '.join(sorted(folders)[:4])}",
+            "the path of one of them",
         )
     (folder,) = folders
     by_stem = {PurePosixPath(name).name.removesuffix(INDEX): name for name in sorted(weights, key=natural)}
@@ -181,8 +182,9 @@ def _choose(files: _Files, weights: list[str], checkpoint: str) -> tuple[str, st
             listed = {kind: value["name"] for kind, value in json.loads(raw).items() if value["name"]}
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise BadInput(
-                f"{files.path}/{beside(CHECKPOINTS)}: {error!r}; accepted: the names of best_checkpoint and "
-                "last_checkpoint"
+                f"{files.path}/{beside(CHECKPOINTS)}",
+                f"{error!r}",
+                "the names of best_checkpoint and last_checkpoint",
             ) from error
     newest = (
         files.read(beside(NEWEST), SETTINGS_BYTES).decode("utf-8", "replace")
@@ -207,13 +209,13 @@ def _opened(path: str) -> Iterator[_Files]:
         yield _folder(path)
         return
     if not stat.S_ISREG(found.st_mode):
-        raise BadInput(f"{path}: is neither a file nor a folder; accepted: {_ACCEPTED}")
+        raise BadInput(path, "is neither a file nor a folder", _ACCEPTED)
     if found.st_size > LOG_BYTES:
-        raise BadInput(f"{path}: is larger than {LOG_BYTES // 2**30} GiB; accepted: {_ACCEPTED}")
+        raise BadInput(path, f"is larger than {LOG_BYTES // 2**30} GiB", _ACCEPTED)
     with Path(path).open("rb") as file:
         head = file.read(512)
     if not (head.startswith((*ZIP, b"\x1f\x8b")) or head[257:262] == b"ustar"):
-        raise BadInput(f"{path}: is no archive; accepted: {_ACCEPTED}")
+        raise BadInput(path, "is no archive", _ACCEPTED)
     with open_archive(Path(path)) as archive:
         yield _packed(path, archive)
 
@@ -240,9 +242,9 @@ def _packed(path: str, archive: Archive) -> _Files:
     files = _Files(path, lambda name: open_member(archive, members[name]))
     for member in members_of(archive):
         if member.kind == "link":
-            raise BadInput(f"{path}: {member.name}: is a link; accepted: archives of files alone")
+            raise BadInput(path, f"{member.name}: is a link", "archives of files alone")
         if member.kind == "other":
-            raise BadInput(f"{path}: {member.name}: is no file; accepted: {_ACCEPTED}")
+            raise BadInput(path, f"{member.name}: is no file", _ACCEPTED)
         if member.kind == "file":
             files.add(member.name, member.size)
             members[member.name] = member  # the later one counts, as in unpacking

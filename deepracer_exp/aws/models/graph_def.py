@@ -244,7 +244,7 @@ def read_weights(path: str | Path, raw: bytes | None = None) -> dict[str, Tensor
         if not tensors:
             raise ValueError("holds no weights")
     except ValueError as error:
-        raise BadInput(f"{path}: {error}; accepted: {accepted}") from error
+        raise BadInput(path, error, accepted) from error
     return tensors
 
 

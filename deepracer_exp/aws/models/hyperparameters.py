@@ -107,7 +107,7 @@ def read_hyperparameters(
         except BadInput as error:
             if refused is None:
                 raise
-            refused.append(str(error).removeprefix(f"{path}: "))
+            refused.append(error.without(path))
         else:
             given.append(key)
     return Hyperparameters(**values, given=tuple(given))  # type: ignore[arg-type]

@@ -105,7 +105,7 @@ def read_training_params(path: str) -> tuple[JobSettings, ...]:
     accepted = "parameters of a training, KEY: VALUE"
     data = read_yaml(path, accepted)
     if not isinstance(data, dict):
-        raise BadInput(f"{path}: holds no keys; accepted: {accepted}")
+        raise BadInput(path, "holds no keys", accepted)
     lists = {str(key): value if isinstance(value, list) else [value] for key, value in data.items()}
     workers = max(len(lists.get(key, ())) for key in ENV_KEYS)
     same = {key: key for key in ENV_KEYS}
@@ -127,7 +127,7 @@ def _read_env(path: str) -> dict[str, str]:
         if not (text := line.strip()) or text.startswith("#"):
             continue
         if (found := _LINE.fullmatch(text)) is None:
-            raise BadInput(f"{path}: line {number}: {text[:80]}; accepted: {accepted}")
+            raise BadInput(path, f"line {number}: {text[:80]}", accepted)
         value = found[2].strip()
         quoted = re.match(r"""(["'])(.*?)\1""", value)
         # A shell ends an unquoted value at a blank.
@@ -142,7 +142,7 @@ def _settings(
         if (word := values.get(keys.get(key, key))) is None:
             return None
         if word.lower() not in (*_TRUE, *_FALSE):
-            raise BadInput(f"{path}: {keys.get(key, key)}={word[:80]}; accepted: True, False")
+            raise BadInput(path, f"{keys.get(key, key)}={word[:80]}", "True, False")
         return word.lower() in _TRUE
 
     def share(key: str) -> float | None:
@@ -153,14 +153,14 @@ def _settings(
         except ValueError:
             number = -1.0
         if not 0.0 <= number <= 1.0:
-            raise BadInput(f"{path}: {keys[key]}={word[:80]}; accepted: a share of the lap, 0 to 1")
+            raise BadInput(path, f"{keys[key]}={word[:80]}", "a share of the lap, 0 to 1")
         return number
 
     race_type = values.get(keys["RACE_TYPE"], RACE_TYPES[0]).upper()
     if race_type not in RACE_TYPES:
         known = ", ".join(RACE_TYPES)
         raise BadInput(
-            f"{path}: {keys['RACE_TYPE']}={race_type[:80]}; accepted: {known}{nearest(race_type, RACE_TYPES)}"
+            path, f"{keys['RACE_TYPE']}={race_type[:80]}", f"{known}{nearest(race_type, RACE_TYPES)}"
         )
     return JobSettings(
         file=path,

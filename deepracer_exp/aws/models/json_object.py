@@ -28,14 +28,14 @@ class JsonObject:
         self.path = Path(path)
         data = read_json(path, kind, raw)
         if not isinstance(data, dict):
-            raise BadInput(f"{self.path}: holds a {type(data).__name__}; accepted: {accepted}")
+            raise BadInput(self.path, f"holds a {type(data).__name__}", accepted)
         self.data: Mapping[str, Any] = data
 
     def bad(self, key: str, value: object, accepted: str) -> BadInput:
         """Return the error for one value; None stands for a missing one."""
         shown = "missing" if value is None else json.dumps(value, ensure_ascii=False, default=repr)
         shown = shown if len(shown) <= 80 else shown[:79] + "…"
-        return BadInput(f"{self.path}: {key}: {shown}; accepted: {accepted}")
+        return BadInput(self.path, f"{key}: {shown}", accepted)
 
     def choice(self, key: str, value: object, known: Sequence[str], lower: bool = True) -> str:
         """Return one of the known words, stripped and by default lower-cased, as the service reads it."""

@@ -63,7 +63,7 @@ def read_index(raw: bytes, where: str) -> dict[str, Entry]:
         entries = dict(_entries(memoryview(raw)))
         _check_places(entries)
     except (ValueError, struct.error) as error:
-        raise BadInput(f"{where}: {error}; accepted: the .index of a TensorFlow checkpoint") from error
+        raise BadInput(where, error, "the .index of a TensorFlow checkpoint") from error
     return entries
 
 
@@ -75,12 +75,12 @@ def read_tensors(entries: Mapping[str, Entry], data: bytes, where: str) -> dict[
     """
     size = max(entry.offset + entry.size for entry in entries.values())
     if len(data) != size:
-        raise BadInput(f"{where}: has {len(data):,} bytes; accepted: the {size:,} of the checkpoint's index")
+        raise BadInput(where, f"has {len(data):,} bytes", f"the {size:,} of the checkpoint's index")
     tensors = {}
     for name, entry in entries.items():
         part = memoryview(data)[entry.offset : entry.offset + entry.size]
         if masked_crc32c(part) != entry.crc:
-            raise BadInput(f"{where}: {name}: corrupt, its checksum is wrong; copy the file again")
+            raise BadInput(where, f"{name}: corrupt, its checksum is wrong; copy the file again")
         if entry.dtype == _FLOAT:
             tensors[name] = np.frombuffer(part, "<f4").reshape(entry.shape)
     return tensors

@@ -63,15 +63,15 @@ def read_route(path: str | Path) -> np.ndarray:
     accepted = f"a .npy with {ROUTE_ROWS}"
     with (
         open_user_file(path, accepted, ROUTE_BYTES) as file,
-        reading(f"{path}: not a NumPy array file", accepted),
+        reading(path, accepted, "not a NumPy array file"),
     ):
         rows = np.lib.format.read_array(file, allow_pickle=False)
     if rows.dtype.kind not in "fiu":
-        raise BadInput(f"{path}: holds {rows.dtype.name} values; accepted are {ROUTE_ROWS}")
+        raise BadInput(path, f"holds {rows.dtype.name} values; accepted are {ROUTE_ROWS}")
     try:
         return checked_rows(rows)
     except BadInput as error:
-        raise BadInput(f"{path}: {error}") from None
+        raise BadInput(path, error) from None
 
 
 def checked_rows(rows: np.ndarray) -> np.ndarray:
@@ -114,7 +114,7 @@ def world_rows(name: str) -> np.ndarray:
     """
     if name not in worlds():
         known = f"`deepracer-exp tracks` lists all {len(worlds())}"
-        raise BadInput(f"{name}: no such world{nearest(name, worlds())}; {known}")
+        raise BadInput(name, f"no such world{nearest(name, worlds())}; {known}")
     # Each world is stored as its second differences.
     rows = _bends()[name].astype(np.int64).cumsum(axis=0).cumsum(axis=0) / UNITS_PER_M
     rows.flags.writeable = False

@@ -30,7 +30,7 @@ class Parent:
         try:
             _, lineage = prepare_clone([f"run={run}", f"name={study}"], runs_dir, None).start
         except BadInput as error:
-            raise BadInput(f"parent={run}: {str(error).removeprefix(f'{run}: ')}") from error
+            raise BadInput(f"parent={run}", error.without(run)) from error
         return cls(lineage.parent_dir, int(lineage.checkpoint))
 
     def clone(self, overrides: Sequence[str], runs_dir: Path, *, stored: bool) -> "Clone":

@@ -200,8 +200,6 @@ def refuse_files(storage: str | None, runs_dir: Path, store: Store | None, nodes
         return
     where = f"a file, and the Ray cluster has nodes on {len(nodes)} machines"
     if resolve_database(storage, runs_dir).file is not None:
-        raise BadInput(
-            f"sweep.storage={storage or 'null'}: {where}; accepted: postgresql+psycopg://user@host/name"
-        )
+        raise BadInput(f"sweep.storage={storage or 'null'}", where, "postgresql+psycopg://user@host/name")
     if store is not None and store.sqlite_file is not None:
-        raise BadInput(f"tracking.uri={store.shown}: {where}; accepted: http://host:port, or tracking=off")
+        raise BadInput(f"tracking.uri={store.shown}", where, "http://host:port, or tracking=off")

@@ -115,19 +115,17 @@ def resolve_database(url: str | None, runs_dir: Path) -> Database:
         parsed = sa.make_url(with_password(url))
     except (ArgumentError, ValueError):
         # Without a form it is unknown which part of it is the password.
-        raise BadInput(f"sweep.storage: not the URL of a database; {_ACCEPTED}") from None
+        raise BadInput("sweep.storage", f"not the URL of a database; {_ACCEPTED}") from None
     shown = f"sweep.storage={without_passwords(url)}"
     kind = parsed.get_backend_name()
     if kind not in _KINDS:
-        raise BadInput(
-            f"{shown}: not a kind of database that holds sweeps{nearest(kind, _KINDS)}; {_ACCEPTED}"
-        )
+        raise BadInput(shown, f"not a kind of database that holds sweeps{nearest(kind, _KINDS)}; {_ACCEPTED}")
     name = parsed.database
     if kind == "sqlite" and (not name or name.startswith((":", "file:")) or parsed.host or parsed.query):
-        raise BadInput(f"{shown}: names no file; accepted: sqlite:////path/sweeps.db")
+        raise BadInput(shown, "names no file", "sqlite:////path/sweeps.db")
     _check_driver(parsed, shown)
     if not name:
-        raise BadInput(f"{shown}: names no database; accepted: {kind}://user@host/NAME")
+        raise BadInput(shown, "names no database", f"{kind}://user@host/NAME")
     return _of_file(Path(name), shown) if kind == "sqlite" else Database(parsed, shown)
 
 
@@ -135,13 +133,13 @@ def _check_driver(url: sa.URL, shown: str) -> None:
     try:
         dialect = url.get_dialect()
         if dialect.is_async:
-            raise BadInput(f"{shown}: a driver for asynchronous programs; {_ACCEPTED}")
+            raise BadInput(shown, f"a driver for asynchronous programs; {_ACCEPTED}")
         dialect.import_dbapi()
     except NoSuchModuleError:
-        raise BadInput(f"{shown}: SQLAlchemy knows no such driver; {_ACCEPTED}") from None
+        raise BadInput(shown, f"SQLAlchemy knows no such driver; {_ACCEPTED}") from None
     except ImportError as error:
         package = _DRIVERS.get(url.get_driver_name(), error.name)
-        raise BadInput(f"{shown}: its driver is missing; install it with: pip install '{package}'") from None
+        raise BadInput(shown, f"its driver is missing; install it with: pip install '{package}'") from None
 
 
 def _of_file(file: Path, shown: str) -> Database:
@@ -164,7 +162,7 @@ def open_storage(url: str | None, runs_dir: Path, patience_s: float = 0.0) -> RD
         try:
             return _waiting(lambda: _open(database), patience_s)
         except (DBAPIError, StorageInternalError) as error:
-            raise BadInput(f"{database.shown}: {_reason(error)}") from None
+            raise BadInput(database.shown, _reason(error)) from None
 
 
 def patiently(call: Callable[[], Result], patience_s: float) -> Result:
@@ -266,4 +264,4 @@ def _rdb(database: Database, *, create: bool) -> RDBStorage:
     try:
         return RDBStorage(url, engine_kwargs=database.engine_options(), skip_table_creation=not create)
     except RuntimeError as error:
-        raise BadInput(f"{database.shown}: {one_line(error)}") from None
+        raise BadInput(database.shown, one_line(error)) from None

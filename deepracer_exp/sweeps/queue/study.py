@@ -57,7 +57,7 @@ def load_study(name: str, storage: RDBStorage) -> Study:
         known = optuna.get_all_study_names(storage)
         there = f"studies: {', '.join(known)}" if known else "there is no study yet"
         raise BadInput(
-            f"study {name}: not found in {redact(str(storage.engine.url))}{nearest(name, known)}; {there}"
+            f"study {name}", f"not found in {redact(str(storage.engine.url))}{nearest(name, known)}; {there}"
         )
     return study
 

@@ -54,7 +54,7 @@ def best_trial(study: optuna.Study) -> FrozenTrial:
     """
     complete = complete_trials(study)
     if not complete:
-        raise BadInput(f"study {study.study_name}: none of its {len(study.trials)} trials is complete yet")
+        raise BadInput(f"study {study.study_name}", f"none of its {len(study.trials)} trials is complete yet")
     numbers = [laps.trial for laps in reranked(study)]
     return next((trial for trial in complete if trial.number in numbers[:1]), complete[0])
 
@@ -95,8 +95,8 @@ def best_run(study: optuna.Study, runs_dir: Path | None = None) -> Path:
     folder = best.folder(base / study.study_name)
     if best.run_dir is None or not is_run(folder):
         raise BadInput(
-            f"study {study.study_name}: {folder} of trial {trial.number} is gone; "
-            "give runs_dir= if the runs have moved"
+            f"study {study.study_name}",
+            f"{folder} of trial {trial.number} is gone; give runs_dir= if the runs have moved",
         )
     return folder
 
@@ -109,7 +109,7 @@ def write_best(study: optuna.Study, runs_dir: Path) -> Path:
     """
     run, folder = best_run(study, runs_dir), runs_dir / study.study_name
     if run.resolve().parent != folder.resolve():
-        raise BadInput(f"study {study.study_name}: its best run {run} does not lie in {folder}")
+        raise BadInput(f"study {study.study_name}", f"its best run {run} does not lie in {folder}")
     values = dict(zip(objectives_of(study), best_values(study), strict=True))
     trial = best_trial(study).number
     return write_best_of_sweep(

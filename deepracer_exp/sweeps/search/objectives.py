@@ -57,8 +57,8 @@ def objectives_of(study: optuna.Study) -> tuple[str, ...]:
     names = study.user_attrs.get("objectives")
     if not isinstance(names, list | tuple) or not set(names) <= set(MEASURES):
         raise BadInput(
-            f"study {study.study_name}: has no objectives that a sweep writes ({', '.join(MEASURES)}); "
-            "it was not made by `deepracer-exp sweep`"
+            f"study {study.study_name}",
+            f"has no objectives that a sweep writes ({', '.join(MEASURES)}); it was not made by `deepracer-exp sweep`",
         )
     return tuple(names)
 

@@ -195,8 +195,8 @@ def _check_cmaes(config: SweepConfig, space: SearchSpace) -> None:
         )
     if all(isinstance(found, CategoricalDistribution) for found in _distributions(space).values()):
         raise BadInput(
-            "sweep.sampler=cmaes: searches ranges, and the space has choices only; "
-            f"accepted for them: {others}"
+            "sweep.sampler=cmaes",
+            f"searches ranges, and the space has choices only; accepted for them: {others}",
         )
 
 

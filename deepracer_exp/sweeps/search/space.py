@@ -7,6 +7,7 @@ from typing import Any
 
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
 from optuna.trial import BaseTrial, FixedTrial
+from pydantic import ValidationError
 
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.dimension import Choice, Choices, Range, as_override, dimension, override_value
@@ -18,7 +19,7 @@ from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.config.sweep import SweepRequest
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.real_car import require_car
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import BadInput, Unknown
 from deepracer_exp.rewards.source import load_reward_source
 
 Check = Callable[[list[str]], Mapping[str, Any]]
@@ -60,8 +61,8 @@ class SearchSpace:
         """
         if not request.space:
             raise BadInput(
-                "sweep: nothing to search; write KEY='interval(LOW,HIGH)', KEY=A,B or sweep=NAME, such as "
-                "sweep=lr_entropy"
+                "sweep",
+                "nothing to search; write KEY='interval(LOW,HIGH)', KEY=A,B or sweep=NAME, such as sweep=lr_entropy",
             )
         found = {key: dimension(key, text) for key, text in request.space.items()}
         trials = _Trials(request, check, found)
@@ -139,14 +140,10 @@ class _Trials:
         self._context: dict[str, str] = {}
         try:
             self._values({})
-        except BadInput as error:
+        except BadInput:
             # The base may be complete only with the searched keys, such as where one of two keys is null.
             self._context = {key: _lines(key, what)[0] for key, what in found.items() if not self._group(key)}
-            try:
-                self._values({})
-            except BadInput as with_context:
-                of_base = not any(key in str(with_context) for key in self._context)
-                raise error if of_base else with_context from None
+            self._values({})
 
     def condition(self, key: str) -> tuple[str | None, tuple[Choice, ...] | None]:
         """Return the key's group if that is searched, and the options of it that have the key; None: all."""
@@ -188,13 +185,12 @@ class _Trials:
                 self._read(parse_experiment(changed))
             else:
                 self._values({**context, one.key: line})
+        except Unknown:
+            raise
         except BadInput as error:
-            message = str(error)
-            if "no such" not in message:
-                message = f"{one.key}={one.expression}: {message}"
-            if "valid integer" in message and isinstance(self._found[one.key], Range):
-                message += f"; of whole numbers: {one.key}='int({one.expression})'"
-            raise BadInput(message) from None
+            accepts_whole = isinstance(self._found[one.key], Range) and _is_of_whole_numbers(error)
+            hint = f"; of whole numbers: {one.key}='int({one.expression})'" if accepts_whole else ""
+            raise BadInput(f"{one.key}={one.expression}", f"{error}{hint}") from None
 
     def _values(self, lines: Mapping[str, str]) -> Mapping[str, Any]:
         """Return all values of the base with these overrides by key; refuse what no run accepts."""
@@ -240,6 +236,12 @@ def _holder(values: Mapping[str, Any], key: str) -> dict[str, Any] | None:
     for part in parent.split(".") if parent else ():
         node = node.get(part) if isinstance(node, dict) else None
     return node if isinstance(node, dict) and (leaf in node or parent in OPEN_MAPPINGS) else None
+
+
+def _is_of_whole_numbers(error: BadInput) -> bool:
+    """Return whether a value was refused because its key accepts whole numbers only."""
+    cause = error.__cause__
+    return isinstance(cause, ValidationError) and cause.errors()[0]["type"].startswith("int_")
 
 
 def _lines(key: str, what: Choices | Range) -> list[str]:
