@@ -11,7 +11,6 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.evaluation.result import Rank
 from deepracer_exp.reports.run_page import write_pictures, write_run_page
 from deepracer_exp.runs.result import FINISHED, STOPPED_EARLY
 from deepracer_exp.stopping.rules import Decision, StoppingRule, build_rule
@@ -23,13 +22,10 @@ from deepracer_exp.tracking.tracker import FINISH_S, Tracker
 from .budget import Alerts
 from .display import ProgressDisplay, RunHeader
 from .machine import machine_use
-from .metrics import NOT_EVALUATED, Finished, Ranking, eval_columns
+from .metrics import NOT_EVALUATED, eval_columns
 from .trainer import Callback, Trainer, TrainResult
 
 logger = logging.getLogger("deepracer_exp")
-
-_DRIVING = "driving"
-"""What ranks a policy that is not evaluated: the training's own episodes."""
 
 
 def standard_callbacks(
@@ -63,7 +59,6 @@ def standard_callbacks(
         ReportCallback(),
         TrackingCallback(tracker, console),
         DisplayCallback(names, console),
-        BestCallback(experiment, setup),
     ]
 
 
@@ -237,12 +232,9 @@ class TrackingCallback(Callback):
 
     def on_iteration_end(self, trainer: Trainer) -> None:
         """Log the row, and the use of the machine, which is not part of the record."""
+        self._tracker.safe_until(trainer.saved_steps)
         self._log(trainer)
         self._tracker.log_machine(machine_use(trainer.experiment.device), step=trainer.env_steps)
-
-    def on_save(self, trainer: Trainer) -> None:
-        """Let the tracker write the points up to here: no resumed run goes back behind them."""
-        self._tracker.safe_until(trainer.env_steps)
 
     def on_train_end(self, trainer: Trainer) -> None:
         """Log the last evaluation of a run that is over; of one that may be resumed, MLflow would keep it."""
@@ -251,6 +243,7 @@ class TrackingCallback(Callback):
 
     def on_run_end(self, trainer: Trainer, result: TrainResult) -> None:
         """Log files and end the run in the store; the result says what was not recorded."""
+        self._tracker.safe_until(trainer.saved_steps)
         for file, folder in files_to_keep(trainer.folder.path):
             self._tracker.log_artifact(file, folder)
         self._tracker.set_tag(END_TAG, f"{result.status}: {result.reason}")
@@ -292,7 +285,7 @@ class DisplayCallback(Callback):
                 budget=str(trainer.budget),
                 folder=str(trainer.folder.path),
             )
-            self._display = ProgressDisplay(self._console, header).__enter__()
+            self._display = trainer.running.enter_context(ProgressDisplay(self._console, header))
 
     def on_iteration_end(self, trainer: Trainer) -> None:
         """Show the row, and how long the rest of the budget takes."""
@@ -300,65 +293,3 @@ class DisplayCallback(Callback):
         _, fraction = trainer.budget.used(*trainer.usage)
         left_s = trainer.row["wall_clock_s"] * (1 / fraction - 1) if fraction else None
         self._display.update(trainer.row, min(fraction, 1.0), left_s)
-
-    def on_fit_end(self, trainer: Trainer) -> None:
-        """Leave the last view on the screen."""
-        if self._display is not None:
-            self._display.__exit__(None, None, None)
-
-
-class BestCallback(Callback):
-    """Keeps the checkpoint of the best policy: by its evaluation, or, without evaluations, by its own episodes."""
-
-    def __init__(self, experiment: Experiment, setup: RaceSetup):
-        self._metric = experiment.checkpoints.metric
-        self._by_driving = experiment.checkpoints.every is None
-        self._ranking = Ranking([course.tracks[0].length_m for course in setup.courses])
-        self._best: dict[str, Any] | None = None
-        """Iteration and env steps of the policy, what it was ranked by, its rank and its evaluation, JSON types."""
-
-    def on_batch(self, trainer: Trainer, finished: Finished) -> None:
-        """Save a policy that drove better than any before, ahead of its update."""
-        if not self._by_driving:
-            return
-        rank = self._ranking.rank(finished)
-        if rank is not None and self._is_better(trainer, rank, _DRIVING, NOT_EVALUATED):
-            trainer.checkpoints.save(trainer.agent, trainer.counters(), best=True)
-
-    def on_iteration_end(self, trainer: Trainer) -> None:
-        """Let the coming checkpoint be the best, if its evaluation is."""
-        trainer.is_best = self._is_best_evaluated(trainer)
-
-    def on_train_end(self, trainer: Trainer) -> None:
-        """Let the last checkpoint be the best, if its evaluation is."""
-        if self._is_best_evaluated(trainer):
-            trainer.checkpoints.mark_best(trainer.iteration)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the best policy's rank, and what is known of each track."""
-        return {"best": self._best, "ranking": self._ranking.state_dict()}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore both."""
-        self._best = state["best"]
-        self._ranking.load_state_dict(state["ranking"])
-
-    def summary(self, trainer: Trainer) -> dict[str, Any]:
-        """Return the best policy."""
-        return {"best": self._best}
-
-    def _is_best_evaluated(self, trainer: Trainer) -> bool:
-        found = trainer.evaluation
-        return found is not None and self._is_better(
-            trainer, found.rank(self._metric), self._metric, eval_columns(found)
-        )
-
-    def _is_better(
-        self, trainer: Trainer, rank: Rank, metric: str, columns: Mapping[str, float | None]
-    ) -> bool:
-        """Return whether a policy ranks above the best one, and remember it then."""
-        if self._best is not None and list(rank) <= self._best["rank"]:
-            return False
-        moment = {"iteration": trainer.iteration, "env_steps": trainer.env_steps}
-        self._best = {**moment, "metric": metric, "rank": list(rank), **columns}
-        return True

@@ -76,6 +76,7 @@ def run_training(
     callbacks: Sequence[Callback] = (),
     run_name: str | None = None,
     tags: Mapping[str, str] = MappingProxyType({}),
+    created: Callable[[Path], None] | None = None,
 ) -> TrainResult:
     """Train an experiment.
 
@@ -87,6 +88,7 @@ def run_training(
         callbacks: called beside the standard ones, see `standard_callbacks`.
         run_name: of the run in MLflow; None: from the reward function and the time.
         tags: of the run in MLflow, beside its own.
+        created: called with the folder of the run before it is recorded anywhere else.
 
     Returns:
         How it ended; `reason` holds a failed run's error.
@@ -100,7 +102,7 @@ def run_training(
     with Interruption(_printing(console)) as interruption:
         setup = read_files(experiment)
         memory = memory_of_pictures(experiment)
-        trainer = _begin(experiment, composition, setup, console, start, callbacks, run_name, tags)
+        trainer = _begin(experiment, composition, setup, console, start, callbacks, run_name, tags, created)
         _print_memory(memory, console)
         return _run(trainer, interruption)
 
@@ -226,6 +228,7 @@ def _begin(
     callbacks: Sequence[Callback] = (),
     run_name: str | None = None,
     tags: Mapping[str, str] = MappingProxyType({}),
+    created: Callable[[Path], None] | None = None,
 ) -> Trainer:
     """Create the folder of a new run and record it."""
     refuse_spent(experiment.budget, Path(experiment.runs_dir) / experiment.name)
@@ -244,12 +247,11 @@ def _begin(
         trainer = Trainer(experiment, setup, folder, composition.mapping, every)
         if start is not None:
             trainer.networks.load_state_dict(start[0].state_dict())
-            trainer.is_best = lineage is None  # there is no other
         if lineage is not None:
             folder.write(LINEAGE, json.dumps(asdict(lineage), indent=2) + "\n")
-        for callback in every:
-            callback.on_run_created(trainer)
-        trainer.save()
+        if created is not None:
+            created(folder.path)
+        trainer.save(best=start is not None and lineage is None)  # of an imported run there is no other
         commit = folder.describe(composition, setup.reward, experiment.seed, names)
     except (OSError, RunFailed) as error:
         folder.remove()

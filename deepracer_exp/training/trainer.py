@@ -34,6 +34,7 @@ from deepracer_exp.runs.result import FAILED, FINISHED
 from deepracer_exp.runs.trace import TraceWriter
 from deepracer_exp.sim.batch import cores
 
+from .best import BestPolicy
 from .budget import Budget
 from .metrics import NOT_EVALUATED, Finished, RunMetrics, track_names
 from .signals import Interruption
@@ -79,29 +80,17 @@ class Callback:
     hurries_when_interrupted = False
     """Leave out `on_train_end` when the run is interrupted, because another process resumes it at once."""
 
-    def on_run_created(self, trainer: "Trainer") -> None:
-        """The folder of a new run exists; nothing has been recorded yet. Not called for a resumed run."""
-
     def on_replay(self, trainer: "Trainer") -> None:
         """`trainer.row` is a row of metrics.jsonl that a resumed run has up to its checkpoint; called for each."""
 
     def on_fit_start(self, trainer: "Trainer") -> None:
-        """The loop is about to start; a stop requested here ends it before any car drives."""
+        """The loop is about to start; a stop requested here ends it before any car drives.
 
-    def on_batch(self, trainer: "Trainer", finished: Finished) -> None:
-        """A batch was collected; the networks are still those that drove it.
-
-        `finished` are the episodes that ended in the batch, whose steps and episodes are counted.
+        What is entered into `trainer.running` here is left once the loop has ended, however it ended.
         """
 
     def on_iteration_end(self, trainer: "Trainer") -> None:
         """The networks are updated and `trainer.row` is measured."""
-
-    def on_save(self, trainer: "Trainer") -> None:
-        """A checkpoint was written from which the run can be resumed."""
-
-    def on_fit_end(self, trainer: "Trainer") -> None:
-        """The loop has ended, however it ended, and no car drives any more."""
 
     def on_train_end(self, trainer: "Trainer") -> None:
         """The run came to its end or was interrupted, but did not fail; its results are written next."""
@@ -141,7 +130,9 @@ class Trainer:
         env_steps: control steps driven by all cars.
         row: metrics of the last iteration, a line of metrics.jsonl.
         evaluation: of the policy after the last iteration, None if it was not evaluated.
-        is_best: whether the policy is the best so far; the next checkpoint becomes `best`.
+        best: which policy is the best so far.
+        saved_steps: env steps of the last checkpoint from which the run can be resumed, 0 before there is one.
+        running: the contexts of the loop, its cars among them.
         stop_reason: why the loop ends, None while it continues.
         limit: the key of the budget that ended it, None if something else did.
         status: what the run is once it ends without interruption or failure.
@@ -198,7 +189,9 @@ class Trainer:
         self.iteration, self.env_steps = 0, 0
         self.row: dict[str, Any] = {}
         self.evaluation: Evaluation | None = None
-        self.is_best = False
+        self.best = BestPolicy(experiment, setup)
+        self.saved_steps = 0
+        self.running = contextlib.ExitStack()
         self.stop_reason: str | None = None
         self.limit: str | None = None
         self.status = FINISHED
@@ -222,14 +215,15 @@ class Trainer:
             TakenOver: another process continues the run.
         """
         self._interruption = interruption
-        with contextlib.ExitStack() as running:
-            collector = self._start(running)
+        with self.running:
+            collector = self._start()
             while collector is not None and self.stop_reason is None:
                 # 1. Collect: count steps and episodes; the networks are still those that drove.
                 batch, collect_s = collector.collect(self.experiment.algorithm)
                 rows, finished = self.metrics.enter(batch["next", "trace"].numpy())
                 self.env_steps += batch.numel()
-                self._call("on_batch", finished)
+                if self.best.drove_best(finished, self.counters()):
+                    self.checkpoints.save(self.agent, self.counters(), best=True)
 
                 # 2. Update the networks, and pass them to the cars.
                 began = time.monotonic()
@@ -240,20 +234,23 @@ class Trainer:
 
                 # 3. Measure: one row of metrics, the steps of the trace.
                 self.row = self._measure(finished, update, batch.numel(), collect_s, update_s)
-                self.evaluation, self.is_best, self._save_requested = None, False, False
+                self.evaluation, self._save_requested = None, False
 
-                # 4. Callbacks: evaluate, stop?, prune?, budget?, record, track, display, best checkpoint.
+                # 4. Callbacks: evaluate, stop?, prune?, budget?, record, track, display.
                 self._call("on_iteration_end")
+                is_best = self.best.evaluated_best(self.evaluation, self.counters())
                 self._trace.write(self.iteration, to_table(rows, self.iteration, self.metrics.track_names))
                 self._check_interruption()
 
                 # 5. Save when due and at the end.
                 if self.stop_reason or self._save_requested or self._is_time_to_save():
-                    self.save(collector)
+                    self.save(collector, is_best)
         assert self.stop_reason is not None
         if interruption.signum is None or not any(one.hurries_when_interrupted for one in self.callbacks):
-            self.evaluation, self.is_best = None, False
+            self.evaluation = None
             self._call("on_train_end")
+            if self.best.evaluated_best(self.evaluation, self.counters()):
+                self.checkpoints.mark_best(self.iteration)
         return self.stop_reason
 
     def request_stop(self, reason: str, status: str = FINISHED, limit: str | None = None) -> None:
@@ -269,12 +266,13 @@ class Trainer:
         """Write a checkpoint after this iteration."""
         self._save_requested = True
 
-    def save(self, collector: Collector | None = None) -> None:
+    def save(self, collector: Collector | None = None, best: bool = False) -> None:
         """Write a checkpoint from which the run can be resumed.
 
         Args:
             collector: whose cars are stored; None: before the first iteration, so that a run which is killed before
                 its first checkpoint can begin again.
+            best: whether the checkpoint becomes `best`.
 
         Raises:
             RunFailed: the disk is full, or a worker was lost.
@@ -291,9 +289,10 @@ class Trainer:
         }
         for callback in self.callbacks:
             state |= callback.state_dict()
-        self.checkpoints.save(self.agent, self.counters(), state, best=self.is_best)
+        state |= self.best.state_dict()
+        self.checkpoints.save(self.agent, self.counters(), state, best=best)
         if collector is not None:
-            self._call("on_save")
+            self.saved_steps = self.env_steps
             self._saved_at = time.monotonic()
 
     def load(self, checkpoint: Path, state: Mapping[str, Any]) -> None:
@@ -312,6 +311,7 @@ class Trainer:
         self._process_began -= state["wall_clock_s"]
         for callback in self.callbacks:
             callback.load_state_dict(state)
+        self.best.load_state_dict(state)
 
     def replay(self, rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         """Pass the rows of metrics.jsonl up to the checkpoint to the callbacks again; return them as they left them."""
@@ -344,6 +344,7 @@ class Trainer:
         }
         for callback in self.callbacks:
             summary |= callback.summary(self)
+        summary["best"] = self.best.record
         logger.log(logging.ERROR if error else logging.INFO, "%s: %s", status, reason, exc_info=error)
         try:
             self.folder.write(SUMMARY, json.dumps(summary, indent=2) + "\n")
@@ -397,16 +398,15 @@ class Trainer:
             "laps": episodes.laps,
         }
 
-    def _start(self, running: contextlib.ExitStack) -> Collector | None:
+    def _start(self) -> Collector | None:
         """Start callbacks and cars; None if there is a reason to stop before that."""
         # There is one already if the run was killed while it was ending, or Ctrl-C came while it began.
         self._check_interruption()
-        running.callback(self._call, "on_fit_end")
         self._call("on_fit_start")
         if self.stop_reason is not None:
             return None
         experiment = self.experiment
-        return running.enter_context(
+        return self.running.enter_context(
             open_collector(
                 experiment.collector,
                 experiment.algorithm,

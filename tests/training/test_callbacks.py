@@ -22,7 +22,7 @@ class At(Callback):
     def __init__(self, iteration, do):
         self.iteration, self.do, self.dir = iteration, do, None
 
-    def on_run_created(self, trainer):
+    def on_fit_start(self, trainer):
         self.dir = trainer.folder.path
 
     def on_iteration_end(self, trainer):

@@ -199,10 +199,6 @@ class TrialRun(Callback):
         ]
         return self._as_trial("FAIL")
 
-    def on_run_created(self, trainer: Trainer) -> None:
-        """Record where the run lies, before it is recorded anywhere else."""
-        self._begin(trainer.folder.path)
-
     def on_iteration_end(self, trainer: Trainer) -> None:
         """Keep the claim and ask the pruners."""
         row = trainer.row
@@ -223,6 +219,7 @@ class TrialRun(Callback):
         return {"study": self._config.study, "trial": self._number}
 
     def _begin(self, run_dir: Path) -> None:
+        """Record where the run lies."""
         self._show(0.0, {})
         tried = self._run or SeedRun(seed=self._seed)
         folder = str(run_dir.resolve())
@@ -335,7 +332,7 @@ class TrialRun(Callback):
         if self._seed:
             experiment, composition, start = self._composed([*own, f"seed={experiment.seed + self._seed}"])
         title, tags = self._title_and_tags()
-        return run_training(experiment, composition, None, start, [self], run_name=title, tags=tags)
+        return run_training(experiment, composition, None, start, [self], title, tags, created=self._begin)
 
     def _resumed(self, run: SeedRun) -> TrainResult | None:
         """Resume a run that was begun; None if there is nothing to resume."""
