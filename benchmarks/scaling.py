@@ -28,7 +28,7 @@ from optuna.storages import RDBStorage
 
 from deepracer_exp.sweeps.queue.claims import TABLE, TrialClaims
 from deepracer_exp.sweeps.queue.storage import open_storage
-from deepracer_exp.sweeps.trial import SeedRun, as_json
+from deepracer_exp.sweeps.trial import SeedRun, runs_as_json
 
 from .command import command_line
 from .report import benchmark_parser, number, table, write_json
@@ -200,7 +200,7 @@ def fill(storage: RDBStorage, study: str, trials: int) -> None:
             **row,
             "study": study,
             "number": number,
-            "runs": json.dumps(as_json([run])),
+            "runs": json.dumps(runs_as_json([run])),
             "objective_values": "[10.0]",
         }
         for number in range(trials)

@@ -28,7 +28,7 @@ from deepracer_exp.config.sweep import SweepRequest
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.runs.files import TRACKING, read_config, read_object
 from deepracer_exp.sweeps.report.labels import ending_of
-from deepracer_exp.sweeps.search.objectives import intermediate_value, values_of
+from deepracer_exp.sweeps.search.objectives import intermediate_value, objective_values
 from deepracer_exp.sweeps.trial import Trial
 
 from .command import command_line, read_metrics, read_summary
@@ -285,7 +285,7 @@ def score(run: Path, objective: str, protocol: EvaluationConfig) -> float:
     if key not in known:
         experiment, policy = stored_policy(run)
         evaluation = Evaluator(experiment, protocol)(policy)
-        known[key] = values_of(evaluation, [objective], protocol.time_s)[0]
+        known[key] = objective_values(evaluation, [objective], protocol.time_s)[0]
         file.write_text(json.dumps(known), encoding="utf-8")
     return float(known[key])
 

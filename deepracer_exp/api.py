@@ -22,8 +22,7 @@ from deepracer_exp.lookup.resolve import resolve
 from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import METRICS, SUMMARY, read_config, read_metrics, read_object
 from deepracer_exp.runs.recording import read_run_recording
-from deepracer_exp.training.run import resume as resume_run
-from deepracer_exp.training.run import run_training
+from deepracer_exp.training.run import resume_training, run_training
 from deepracer_exp.training.trainer import Callback, TrainResult
 
 
@@ -104,7 +103,7 @@ def resume(
     Raises:
         BadInput: it has ended, is being trained, or was started with other values.
     """
-    return resume_run(resolve(str(run), Path(runs_dir), None).path, overrides, console, callbacks)
+    return resume_training(resolve(str(run), Path(runs_dir), None).path, overrides, console, callbacks)
 
 
 def evaluate(run: str | Path, *overrides: str) -> Evaluation:

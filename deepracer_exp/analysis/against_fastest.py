@@ -142,10 +142,10 @@ def loss_in_words(view: LogView, folder: Path) -> str:
     if question is None or kept_lap(question) is None:
         return f"not searched yet: deepracer-exp analyze {folder.name} --fastest"
     found = loss(view, folder)
-    return f"no complete {view.lap_word} from the start line" if found is None else in_words(found)
+    return f"no complete {view.lap_word} from the start line" if found is None else lost_in_words(found)
 
 
-def in_words(found: Loss) -> str:
+def lost_in_words(found: Loss) -> str:
     """Return in a sentence what is lost, and where most."""
     total, causes = found.lap_time_s - found.fastest.lap_time_s, found.by_sector.sum()
     by_sector = found.by_sector.sum(axis=1)

@@ -20,7 +20,7 @@ from .sectors import Sector, sector_at, sectors_now, sectors_of
 from .slower_laps import CHANCE, LEAST_TIMES, SLOWER, slower_laps
 from .statistics import wilson
 from .tables import CANDIDATE_LAPS, DENSE
-from .zigzag import in_words
+from .zigzag import zigzag_in_words
 from .zigzag_log import CURE, ZIGZAG_DEG, ZIGZAG_PER_M, zigzag_now
 
 CRASH_PLACE_M = 1.0
@@ -385,9 +385,7 @@ def _zigzag(view: LogView) -> Finding | None:
     figures, where = zigzag_now(view)
     if figures is None or figures[0] < ZIGZAG_PER_M or not figures[1] >= ZIGZAG_DEG:
         return None
-    sentence = (
-        f"The car zig-zags on straights: {in_words(*figures)} lost in the detour ({where}). Try {CURE}."
-    )
+    sentence = f"The car zig-zags on straights: {zigzag_in_words(*figures)} lost in the detour ({where}). Try {CURE}."
     values = dict(zip(("changes_per_m", "amplitude_deg", "lost_s"), figures, strict=True))
     return Finding("zigzag", sentence, values, {"changes_per_m": ZIGZAG_PER_M, "amplitude_deg": ZIGZAG_DEG})
 

@@ -8,7 +8,7 @@ import pandas as pd
 from deepracer_exp.runs.files import RunRecord
 
 from .evidence import iqm_band
-from .groups import Group
+from .groups import RunGroup
 from .statistics import Values, subsample
 
 CURVES = (
@@ -24,7 +24,7 @@ infinite."""
 _PLACES = 150
 
 
-def curve(group: Group, column: str) -> pd.DataFrame:
+def group_curve(group: RunGroup, column: str) -> pd.DataFrame:
     """Return a learning curve of a group's runs on one track.
 
     Between its values a run keeps the last one; before its first and after its last it has none.
@@ -71,10 +71,10 @@ def _held(steps: Values, values: Values, grid: Values) -> Values:
     return np.where((at >= 0) & (grid <= steps[-1]), values[np.maximum(at, 0)], np.nan)
 
 
-def curves_table(groups: Sequence[Group]) -> pd.DataFrame:
-    """Return all learning curves, a row a point: `group`, `track`, `curve` and the columns of `curve`."""
+def curves_table(groups: Sequence[RunGroup]) -> pd.DataFrame:
+    """Return all learning curves, a row a point: `group`, `track`, `curve` and the columns of `group_curve`."""
     tables = [
-        curve(group.on(course), column).assign(group=group.name, track=course, curve=column)
+        group_curve(group.on(course), column).assign(group=group.name, track=course, curve=column)
         for group in groups
         for course in group.courses
         for column in CURVES

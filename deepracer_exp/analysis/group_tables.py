@@ -10,11 +10,11 @@ from deepracer_exp.runs.result import result_of
 
 from .evidence import Estimate, Interval
 from .group_curves import curves_table
-from .groups import COMPARED, FORMS, Comparison, Group, courses_of
+from .groups import COMPARED, FORMS, Comparison, RunGroup, courses_of
 from .log_tables import NONE, Table
 
 
-def scored(groups: Sequence[Group]) -> Table:
+def scored(groups: Sequence[RunGroup]) -> Table:
     """Return what each group scored: interquartile means over its runs, with their intervals, on each track."""
     several = len(courses_of(groups)) > 1
     rows = []
@@ -62,7 +62,7 @@ def differences_table(found: Sequence[Comparison]) -> Table:
     return Table(heads, tuple(rows), 3 + several)
 
 
-def sentences(groups: Sequence[Group], found: Sequence[Comparison]) -> list[str]:
+def sentences(groups: Sequence[RunGroup], found: Sequence[Comparison]) -> list[str]:
     """Return what the tables say, in sentences: the verdict on the lap first."""
     alone = len(courses_of(groups)) == 1
     told = [
@@ -84,7 +84,7 @@ def sentences(groups: Sequence[Group], found: Sequence[Comparison]) -> list[str]
     return told
 
 
-def as_json(groups: Sequence[Group], found: Sequence[Comparison]) -> dict[str, Any]:
+def groups_as_json(groups: Sequence[RunGroup], found: Sequence[Comparison]) -> dict[str, Any]:
     """Return everything that is compared, JSON types; infinite seconds, of laps never completed, are null."""
     curves = curves_table(groups)
     return {

@@ -29,7 +29,7 @@ _MOST_WORDS = 3
 
 
 @dataclass(frozen=True)
-class Group:
+class RunGroup:
     """Runs that are alike but for their seed, and for their track if they have several."""
 
     name: str
@@ -40,9 +40,9 @@ class Group:
         """Return the tracks on which its policies are evaluated, in the order of the runs."""
         return list(dict.fromkeys(map(course_of, self.records)))
 
-    def on(self, course: str) -> "Group":
+    def on(self, course: str) -> "RunGroup":
         """Return its runs on one track."""
-        return Group(self.name, tuple(one for one in self.records if course_of(one) == course))
+        return RunGroup(self.name, tuple(one for one in self.records if course_of(one) == course))
 
     def scores(self, figure: str) -> Values:
         """Return a figure of the best checkpoints, one of FIGURES; infinity where a lap was never completed.
@@ -75,7 +75,7 @@ def course_of(record: RunRecord) -> str:
     return course_names(track) + f", {direction}" * (direction != "forward")
 
 
-def group_runs(named: Iterable[tuple[str | None, RunRecord]]) -> list[Group]:
+def group_runs(named: Iterable[tuple[str | None, RunRecord]]) -> list[RunGroup]:
     """Put runs into groups.
 
     Args:
@@ -106,7 +106,7 @@ def group_runs(named: Iterable[tuple[str | None, RunRecord]]) -> list[Group]:
     for number, (key, label) in enumerate(zip(open_groups, labels, strict=True), 1):
         names[key] = label if labels.count(label) == 1 else f"{label} ({number})"
     return [
-        Group(str(names[key]), tuple(records[number] for number in numbers))
+        RunGroup(str(names[key]), tuple(records[number] for number in numbers))
         for key, numbers in members.items()
     ]
 
@@ -148,7 +148,7 @@ def _default(config: Mapping[str, Any], key: str) -> str:
     return value_text(value, 24)
 
 
-def courses_of(groups: Sequence[Group]) -> list[str]:
+def courses_of(groups: Sequence[RunGroup]) -> list[str]:
     """Return all tracks of groups."""
     return list(dict.fromkeys(course for group in groups for course in group.courses))
 
@@ -171,7 +171,7 @@ class Comparison:
         return self.difference.verdict(*words)
 
 
-def compared(groups: Sequence[Group]) -> list[Comparison]:
+def compared(groups: Sequence[RunGroup]) -> list[Comparison]:
     """Hold each group against the first: on each track that both have, and on all of these together."""
     found: list[Comparison] = []
     first, *others = groups
@@ -191,7 +191,7 @@ def compared(groups: Sequence[Group]) -> list[Comparison]:
 
 
 def _comparison(
-    group: Group, other: Group, course: str | None, figure: str, pairs: Sequence[tuple[Values, Values]]
+    group: RunGroup, other: RunGroup, course: str | None, figure: str, pairs: Sequence[tuple[Values, Values]]
 ) -> Comparison:
     ours, theirs = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
     lower_is_better = FORMS[figure][2] < 0

@@ -11,7 +11,7 @@ from deepracer_exp.errors import count
 from .against_fastest import loss_in_words
 from .charts.runs import run_folder
 from .log_view import LogView
-from .zigzag import in_words
+from .zigzag import zigzag_in_words
 from .zigzag_log import zigzag_now
 
 NONE = "\N{EN DASH}"
@@ -153,7 +153,7 @@ def facts(view: LogView) -> list[tuple[str, str]]:
         found.append(("Lap times", words))
     figures, where = zigzag_now(view)
     if figures is not None:
-        found.append(("Zig-zag on straights", f"{in_words(*figures)} ({where})"))
+        found.append(("Zig-zag on straights", f"{zigzag_in_words(*figures)} ({where})"))
     folder = run_folder(view)
     if folder is not None and view.episodes["lap_time_s"].notna().any():
         found.append(("Against the fastest lap", loss_in_words(view, folder)))

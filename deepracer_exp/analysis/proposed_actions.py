@@ -93,7 +93,7 @@ def fast_laps(lap_time_s: ArrayLike) -> NDArray[np.bool_]:
     return times_s <= (1.0 + FAST) * times_s[complete].min() if complete.any() else complete
 
 
-def in_words(fast: int, complete: int, fastest_s: float, where: str) -> str:
+def fast_laps_in_words(fast: int, complete: int, fastest_s: float, where: str) -> str:
     """Return which laps count: `fast` of `complete`, driven `where`."""
     return (
         f"{fast:,} of {count(complete, 'complete lap')} without a reset {where}: those at most {FAST:.0%} slower "
@@ -128,7 +128,7 @@ def commands_of_log(recording: Recording, track: str | None = None) -> Commands:
         if wanted.any()
     ]
     where = f"on {views[0].track_name or 'the track'}"
-    words = in_words(int(fast.sum()), complete, float(np.nanmin(every_s)), where)
+    words = fast_laps_in_words(int(fast.sum()), complete, float(np.nanmin(every_s)), where)
     rows = pd.concat(
         [view.of_episodes(wanted, "steer", "throttle") for view, wanted in zip(views, of_view, strict=True)]
     ).dropna()

@@ -244,7 +244,7 @@ def _one_by_one(
     try:
         with Guard(function.time_limit_s) as guard:
             for at, given in enumerate(params.dicts(some)):
-                paid[at] = function.pay(given)
+                paid[at] = function.compute(given)
                 guard.restart()
     except (RewardFailed, Misconduct) as error:
         what = error.what if isinstance(error, RewardFailed) else str(error)

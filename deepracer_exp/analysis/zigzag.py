@@ -73,10 +73,10 @@ class ZigZag:
 
     def words(self) -> str:
         """Return the figures: ``1.84 changes of steering a metre, 12 degrees to either side, 0.051 s a lap``."""
-        return in_words(self.changes_per_m, self.amplitude_deg, self.lost_s)
+        return zigzag_in_words(self.changes_per_m, self.amplitude_deg, self.lost_s)
 
 
-def in_words(changes_per_m: float | None, amplitude_deg: float | None, lost_s: float | None) -> str:
+def zigzag_in_words(changes_per_m: float | None, amplitude_deg: float | None, lost_s: float | None) -> str:
     """Return the figures of a `ZigZag` in words."""
     if changes_per_m is None or lost_s is None:
         return "no straight was driven"
@@ -152,7 +152,7 @@ def zigzag_in(steps: pd.DataFrame, course: Track | None, wanted: NDArray[np.bool
     )
 
 
-def total(parts: Iterable[ZigZag]) -> ZigZag:
+def total_zigzag(parts: Iterable[ZigZag]) -> ZigZag:
     """Return what several add up to."""
     return sum(parts, ZigZag())
 

@@ -43,7 +43,7 @@ Archive = tarfile.TarFile | zipfile.ZipFile
 
 
 @dataclass(frozen=True)
-class Member:
+class ArchiveMember:
     """A member of an archive."""
 
     name: str
@@ -54,7 +54,7 @@ class Member:
     entry: tarfile.TarInfo | zipfile.ZipInfo
 
     @classmethod
-    def of(cls, entry: tarfile.TarInfo | zipfile.ZipInfo) -> "Member":
+    def of(cls, entry: tarfile.TarInfo | zipfile.ZipInfo) -> "ArchiveMember":
         """Return the member that an archive lists as an entry."""
         if isinstance(entry, tarfile.TarInfo):
             link = entry.islnk() or entry.issym()
@@ -73,16 +73,16 @@ def open_archive(path: Path) -> Archive:
     return zipfile.ZipFile(path) if zipped else tarfile.open(path, "r:*", tarinfo=_SmallHeader)
 
 
-def members_of(archive: Archive) -> Iterator[Member]:
+def members_of(archive: Archive) -> Iterator[ArchiveMember]:
     """Yield the members in the order of the archive: going back would mean reading it again."""
     if isinstance(archive, zipfile.ZipFile):
-        yield from map(Member.of, archive.infolist())
+        yield from map(ArchiveMember.of, archive.infolist())
         return
     while (entry := archive.next()) is not None:
-        yield Member.of(entry)
+        yield ArchiveMember.of(entry)
 
 
-def open_member(archive: Archive, member: Member) -> IO[bytes]:
+def open_member(archive: Archive, member: ArchiveMember) -> IO[bytes]:
     """Open a file in an archive for reading.
 
     Raises:

@@ -94,7 +94,7 @@ def _analyze(args: argparse.Namespace) -> int:
     from deepracer_exp.analysis.reward_replay import replay_reward
     from deepracer_exp.analysis.reward_terms import run_terms
     from deepracer_exp.reports.lap_replay import laps_of_log
-    from deepracer_exp.reports.log_report import LogPage, write_page
+    from deepracer_exp.reports.log_report import LogPage, write_log_page
     from deepracer_exp.runs.files import read_config, sees_pictures
     from deepracer_exp.runs.recording import is_traced_run, read_log
 
@@ -119,7 +119,7 @@ def _analyze(args: argparse.Namespace) -> int:
     out = Path(args.output or default)
     found = findings(view, target_s)
     with writing(f"--output {out}", "a file in a folder"):
-        write_page(out, LogPage(view, found, replay, terms, strip))
+        write_log_page(out, LogPage(view, found, replay, terms, strip))
     if laps is not None:
         write_laps(args.replay, laps)
     if line is not None:

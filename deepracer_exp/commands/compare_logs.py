@@ -9,7 +9,7 @@ from deepracer_exp.errors import writing
 from deepracer_exp.runs.files import TRACE
 
 from .arguments import Stores
-from .compared import Item, light, write_page
+from .compared import Item, light, write_comparison_page
 from .output import print_table, table_console, warnings_on_stderr
 from .pages import end_with_page, page_name
 from .replay import write_laps
@@ -50,7 +50,7 @@ def compare_recordings(args: argparse.Namespace, items: Sequence[Item]) -> int:
     ]
     table = Table(("recording", "driven"), tuple((view.name, headline(view)) for view in views), 2)
     told = ["Logs know the laps of the training only, driven by a policy that explores."]
-    out = write_page(args.output, items, told, [("Recordings", table, "")], charts)
+    out = write_comparison_page(args.output, items, told, [("Recordings", table, "")], charts)
     if args.replay is not None:
         write_laps(args.replay, laps_of_log(whole[0], whole[1]))
     print_table(table_console(), "Recordings", table)

@@ -12,7 +12,7 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.files import METRICS
 
 from .arguments import Stores
-from .compared import Item, light, write_page
+from .compared import Item, light, write_comparison_page
 from .output import print_table, table_console
 from .pages import end_with_page
 from .replay import write_laps
@@ -20,7 +20,7 @@ from .startup import check_policy
 
 if TYPE_CHECKING:
     from deepracer_exp.analysis.charts.figure import Chart
-    from deepracer_exp.analysis.groups import Group
+    from deepracer_exp.analysis.groups import RunGroup
     from deepracer_exp.analysis.log_tables import Table
     from deepracer_exp.runs.files import RunRecord
 
@@ -41,7 +41,7 @@ _DIFFERENCES = (
 def compare_runs(args: argparse.Namespace, items: Sequence[Item], stores: Stores) -> int:
     """Compare runs, and groups of them."""
     from deepracer_exp.analysis.group_curves import curves_table
-    from deepracer_exp.analysis.group_tables import as_json
+    from deepracer_exp.analysis.group_tables import groups_as_json
     from deepracer_exp.analysis.groups import compared
 
     groups = _groups(items)
@@ -49,7 +49,7 @@ def compare_runs(args: argparse.Namespace, items: Sequence[Item], stores: Stores
     if args.format == "csv":
         curves_table(groups).to_csv(sys.stdout, index=False)
     elif args.format == "json":
-        print(json.dumps(as_json(groups, compared(groups)), indent=1))
+        print(json.dumps(groups_as_json(groups, compared(groups)), indent=1))
     if args.format == "table" or args.output is not None:
         _show(args, items, _best(groups), len(groups), records)
     if args.replay is not None:
@@ -66,9 +66,9 @@ def compare_runs(args: argparse.Namespace, items: Sequence[Item], stores: Stores
     return 0
 
 
-def _groups(items: Sequence[Item]) -> "list[Group]":
+def _groups(items: Sequence[Item]) -> "list[RunGroup]":
     """Return the groups of runs; an experiment among several keeps its name."""
-    from deepracer_exp.analysis.groups import Group, group_runs
+    from deepracer_exp.analysis.groups import RunGroup, group_runs
     from deepracer_exp.runs.files import read_record
 
     known: dict[Path, RunRecord] = {}
@@ -93,21 +93,23 @@ def _groups(items: Sequence[Item]) -> "list[Group]":
             pair = item.group, read(path)
             if pair not in pairs:
                 pairs.append(pair)
-    groups: list[Group] = []
+    groups: list[RunGroup] = []
     for pool, pairs in pools.items():
         own = group_runs(pairs)
         if pool:
-            own = [Group(pool if len(own) == 1 else f"{pool}: {group.name}", group.records) for group in own]
+            own = [
+                RunGroup(pool if len(own) == 1 else f"{pool}: {group.name}", group.records) for group in own
+            ]
         groups += own
     return groups
 
 
-def _best(groups: "list[Group]") -> "list[Group]":
+def _best(groups: "list[RunGroup]") -> "list[RunGroup]":
     """Return the groups that are shown."""
     if len(groups) <= _MOST_GROUPS:
         return groups
 
-    def score_s(group: "Group") -> float:
+    def score_s(group: "RunGroup") -> float:
         found = group.estimate("race_score_s")
         return float("inf") if found is None else found.iqm
 
@@ -117,21 +119,21 @@ def _best(groups: "list[Group]") -> "list[Group]":
 def _show(
     args: argparse.Namespace,
     items: Sequence[Item],
-    groups: "list[Group]",
+    groups: "list[RunGroup]",
     of_all: int,
     records: "list[RunRecord]",
 ) -> None:
     """Print what is compared and write the page."""
-    from deepracer_exp.analysis.charts.groups import best_checkpoints, learning_curves
+    from deepracer_exp.analysis.charts.groups import best_checkpoints, learning_curve_charts
     from deepracer_exp.analysis.charts.runs import generalisation_matrix, stored_completion
     from deepracer_exp.analysis.group_tables import differences_table, scored, sentences
-    from deepracer_exp.analysis.groups import Group, compared, course_of
+    from deepracer_exp.analysis.groups import RunGroup, compared, course_of
 
     single = all(len(group.records) == 1 for group in groups)
     tables: list[tuple[str, Table, str]] = []
     if single:
         letters = dict(zip(ascii_uppercase, groups, strict=False))
-        groups = [Group(f"{letter}  {group.name}", group.records) for letter, group in letters.items()]
+        groups = [RunGroup(f"{letter}  {group.name}", group.records) for letter, group in letters.items()]
         told = ["Each run is alone: nothing says how much of a difference is chance. Train more seeds."]
     else:
         found = compared(groups)
@@ -144,12 +146,12 @@ def _show(
     shown = [record for group in groups for record in group.records]
     tables += _run_tables(groups)
     charts = [
-        *learning_curves(groups),
+        *learning_curve_charts(groups),
         best_checkpoints(groups),
         _generations(shown),
         generalisation_matrix([(one.name, course_of(one), stored_completion(one.path)) for one in shown]),
     ]
-    out = write_page(args.output, items, told, tables, charts)
+    out = write_comparison_page(args.output, items, told, tables, charts)
     if args.format == "table":
         console = table_console()
         for title, table, _ in tables:
@@ -160,7 +162,7 @@ def _show(
         end_with_page(out, args.open)
 
 
-def _run_tables(groups: "Sequence[Group]") -> "list[tuple[str, Table, str]]":
+def _run_tables(groups: "Sequence[RunGroup]") -> "list[tuple[str, Table, str]]":
     """Return which runs there are, what each achieved, and in which settings they differ.
 
     Of several groups with several runs, settings are those of the groups, and the results of each run are left out.

@@ -33,7 +33,7 @@ class Item:
         return not is_run(self.paths[0])
 
 
-def write_page(
+def write_comparison_page(
     output: str | None,
     items: Sequence[Item],
     sentences: Sequence[str],

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from rich.text import Text
 
     from deepracer_exp.runs.clean import Removable, StoreOverview
-    from deepracer_exp.runs.lineage import Member
+    from deepracer_exp.runs.lineage import FamilyMember
 
 _MOST_CHANGES = 6
 """Changes of a clone that its lineage shows."""
@@ -151,7 +151,7 @@ def _lineage(args: argparse.Namespace) -> int:
     root = family(run, stores.runs_dir)
     best = best_members(root)
 
-    def grow(member: "Member", tree: Tree) -> Tree:
+    def grow(member: "FamilyMember", tree: Tree) -> Tree:
         for child in member.children:
             grow(child, tree.add(_label(child, run, best)))
         return tree
@@ -173,7 +173,7 @@ def _lineage(args: argparse.Namespace) -> int:
     return 0
 
 
-def _label(member: "Member", run: Path, best: dict[int, str]) -> "Text":
+def _label(member: "FamilyMember", run: Path, best: dict[int, str]) -> "Text":
     """Return two lines: what the run is and achieved, and what it changed."""
     from rich.text import Text
 
@@ -250,7 +250,7 @@ def _promote(args: argparse.Namespace) -> int:
 def _clean(args: argparse.Namespace) -> int:
     from rich.filesize import decimal
 
-    from deepracer_exp.runs.clean import THIN, asked_traces, remove, survey, total
+    from deepracer_exp.runs.clean import THIN, asked_traces, remove, survey, total_bytes
 
     stores = read_stores(args.overrides)
     runs_dir = stores.runs_dir
@@ -271,13 +271,13 @@ def _clean(args: argparse.Namespace) -> int:
         short = asked_traces(found.offered, THIN)
         print(
             f"offered: the traces of {count(len(found.offered), 'finished run')}: --traces drop removes "
-            f"{decimal(total(found.offered))}, --traces thin {decimal(total(short))}"
+            f"{decimal(total_bytes(found.offered))}, --traces thin {decimal(total_bytes(short))}"
         )
     if not removable:
         print("nothing to remove")
     elif args.apply:
         removed = [item for item in removable if remove(item)]
-        print(f"removed {decimal(total(removed))}")
+        print(f"removed {decimal(total_bytes(removed))}")
         for item in removable:
             if item not in removed:
                 print(f"kept: {item.run.relative_to(runs_dir)}: a training or a clone has started meanwhile")
@@ -304,7 +304,7 @@ def _show_removable(items: "Sequence[Removable]", runs_dir: Path, console: "Cons
     from rich.filesize import decimal
     from rich.table import Table
 
-    from deepracer_exp.runs.clean import SPARE_CHECKPOINTS, total
+    from deepracer_exp.runs.clean import SPARE_CHECKPOINTS, total_bytes
 
     if not items:
         return
@@ -317,7 +317,7 @@ def _show_removable(items: "Sequence[Removable]", runs_dir: Path, console: "Cons
             what += f": {shown}"
         table.add_row(decimal(item.size), what, str(item.run.relative_to(runs_dir)))
     table.add_row()
-    table.add_row(decimal(total(items)), "in all", "")
+    table.add_row(decimal(total_bytes(items)), "in all", "")
     console.print(table)
     console.print()
 

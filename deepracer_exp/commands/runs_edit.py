@@ -206,7 +206,7 @@ def _delete(args: argparse.Namespace) -> int:
     from rich.filesize import decimal
 
     from deepracer_exp.lookup.resolve import resolve
-    from deepracer_exp.runs.clean import deletable, remove, total
+    from deepracer_exp.runs.clean import deletable, remove, total_bytes
     from deepracer_exp.runs.files import read_run_id
     from deepracer_exp.tracking.delivery import marked_deleted
 
@@ -223,7 +223,7 @@ def _delete(args: argparse.Namespace) -> int:
             raise BadInput(
                 f"{count(len(items), 'run')}: nothing was deleted; give --yes to delete without a question"
             )
-        print(f"delete {count(len(items), 'run')}, {decimal(total(items))}? [y/N] ", end="", flush=True)
+        print(f"delete {count(len(items), 'run')}, {decimal(total_bytes(items))}? [y/N] ", end="", flush=True)
         if sys.stdin.readline().strip().lower() not in ("y", "yes"):
             print("nothing was deleted")
             return 0

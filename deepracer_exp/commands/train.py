@@ -189,10 +189,10 @@ def _resume(args: argparse.Namespace) -> int:
 
     from rich.console import Console
 
-    from deepracer_exp.training.run import resume
+    from deepracer_exp.training.run import resume_training
 
     with warnings_on_stderr():
-        outcome = resume(run_dir, overrides, Console(stderr=True))
+        outcome = resume_training(run_dir, overrides, Console(stderr=True))
     print_result(outcome, experiment.tracking)
     return outcome.exit_code
 

@@ -24,7 +24,7 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.source import NO_REWARD
 
 from .race_protocol import RaceProtocol
-from .result import HELD_OUT, USUAL, Evaluation, Group
+from .result import HELD_OUT, USUAL, Evaluation, TrialGroup
 
 if TYPE_CHECKING:
     from deepracer_exp.analysis.zigzag import ZigZag
@@ -36,7 +36,7 @@ _DRIVEN = [PACKED[name] for name in ("X", "Y", "steer", "tstamp", "episode_statu
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trial:
+class EvaluationTrial:
     """Track, conditions and start of one car."""
 
     course: int
@@ -74,7 +74,7 @@ class Evaluator:
         if config.held_out is not None:
             conditions[HELD_OUT] = _conditions("held_out", config.held_out, experiment)
         self.trials = [
-            Trial(course=place, condition=condition, start_ndist=start)
+            EvaluationTrial(course=place, condition=condition, start_ndist=start)
             for place, course in enumerate(courses)
             for condition in conditions
             for start in _starts(config, course.tracks[0].closed, condition)
@@ -131,14 +131,14 @@ class Evaluator:
                     race.put_back(cars, progress)
         return Evaluation(tuple(self._groups(protocol, np.stack(trace, axis=1))))
 
-    def _groups(self, protocol: RaceProtocol, trace: NDArray[np.float64]) -> list[Group]:
+    def _groups(self, protocol: RaceProtocol, trace: NDArray[np.float64]) -> list[TrialGroup]:
         zigzags = [self._zigzag(trial.course, rows) for trial, rows in zip(self.trials, trace, strict=True)]
         names = [course.name for course in self.race.setup.courses]
         rows: dict[tuple[str, str], list[int]] = {}
         for row, trial in enumerate(self.trials):
             rows.setdefault((names[trial.course], trial.condition), []).append(row)
         return [
-            Group(
+            TrialGroup(
                 track,
                 condition,
                 tuple(own),

@@ -28,7 +28,7 @@ _RESAMPLES = 9999
 
 
 @dataclass(frozen=True, eq=False)
-class Group:
+class TrialGroup:
     """Trials on one track under one condition, or several such groups combined.
 
     A lap interrupted by the end of the race says nothing about the policy and does not count, unless its trial has
@@ -79,9 +79,9 @@ class Group:
     @property
     def zigzag(self) -> "ZigZag":
         """The zig-zag on straights in all trials together."""
-        from deepracer_exp.analysis.zigzag import total  # imports pandas, which only evaluations need
+        from deepracer_exp.analysis.zigzag import total_zigzag  # imports pandas, which only evaluations need
 
-        return total(self.zigzags)
+        return total_zigzag(self.zigzags)
 
     def rank(self, metric: Metric) -> Rank:
         """Return the policy's rank by a metric; without a complete lap, times fall back to progress.
@@ -150,7 +150,7 @@ class Group:
 class Evaluation:
     """Results of one policy."""
 
-    groups: tuple[Group, ...]
+    groups: tuple[TrialGroup, ...]
     """One for each track and condition, track by track."""
 
     @property
@@ -163,7 +163,7 @@ class Evaluation:
         """Names of the conditions."""
         return list(dict.fromkeys(group.condition for group in self.groups))
 
-    def on(self, condition: str) -> Group:
+    def on(self, condition: str) -> TrialGroup:
         """Return a condition's trials on all tracks."""
         groups = [group for group in self.groups if group.condition == condition]
         return _together(groups, "all tracks", condition)
@@ -209,7 +209,7 @@ class Evaluation:
         }
 
 
-def zigzag_columns(group: Group) -> dict[str, float | None]:
+def zigzag_columns(group: TrialGroup) -> dict[str, float | None]:
     """Return the zig-zag of a group by the names of its metrics, as in metrics.jsonl."""
     zigzag = group.zigzag
     return {
@@ -224,8 +224,8 @@ def number(value: float | None, digits: int) -> str:
     return NOTHING if value is None or math.isnan(value) else f"{value:.{digits}f}"
 
 
-def _together(groups: Sequence[Group], track: str, condition: str) -> Group:
-    return Group(
+def _together(groups: Sequence[TrialGroup], track: str, condition: str) -> TrialGroup:
+    return TrialGroup(
         track,
         condition,
         tuple(trial for group in groups for trial in group.trials),

@@ -18,8 +18,8 @@ from deepracer_exp.aws.models.car_archive import (
     check_weights,
     describe_commands,
     name_on_car,
-    packed,
     sensor_notes,
+    tar_gz,
 )
 from deepracer_exp.aws.models.car_controls import full_scale
 from deepracer_exp.aws.models.graph_def import HEAD, policy_graph
@@ -120,7 +120,7 @@ def car_archive(networks: ActorCritic, experiment: Experiment) -> CarArchive:
     if observation.lidar is not None:
         values["lidar_config"] = _lidar_config(observation.lidar)
     text = json.dumps(values, indent=2) + "\n"
-    return CarArchive(packed({METADATA: text.encode(), GRAPH: graph}), metadata, notes)
+    return CarArchive(tar_gz({METADATA: text.encode(), GRAPH: graph}), metadata, notes)
 
 
 def car_actions(actions: ActionSpace) -> tuple[ModelMetadata, Rescaling | None]:

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from deepracer_exp.analysis.proposed_actions import Commands, fast_laps, in_words
+from deepracer_exp.analysis.proposed_actions import Commands, fast_laps, fast_laps_in_words
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.env.trace import PACKED, STATUS_CODE
 from deepracer_exp.errors import BadInput, count
@@ -82,7 +82,9 @@ def commands_of_run(run: StoredRun, checkpoint: str | None) -> Commands:
             continue
         times_s = np.array([one.time_s for one in laps])
         fast = fast_laps(times_s)
-        words.append(in_words(int(fast.sum()), len(laps), float(times_s.min()), f"on {group.track}"))
+        words.append(
+            fast_laps_in_words(int(fast.sum()), len(laps), float(times_s.min()), f"on {group.track}")
+        )
         steps += [recorder.rows(laps[number])[1] for number in np.flatnonzero(fast)]
     name = f"{run.path.name}, checkpoint {stored.path.name}"
     if not steps:

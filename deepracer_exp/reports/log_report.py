@@ -113,10 +113,10 @@ def write_report(log: Recording | RunRecording, path: Path) -> Path:
         OSError: the page cannot be written.
     """
     view = prepare(log)
-    return write_page(path, LogPage(view, findings(view)))
+    return write_log_page(path, LogPage(view, findings(view)))
 
 
-def write_page(path: Path, page: LogPage) -> Path:
+def write_log_page(path: Path, page: LogPage) -> Path:
     """Write the page of a prepared recording atomically.
 
     Raises:

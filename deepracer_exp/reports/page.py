@@ -60,7 +60,9 @@ def plot(figure: Figure, name: str, title: str, narrow: Figure, least_width: int
     layout = narrow.layout.to_plotly_json()
     whole["narrow"] = {key: value for key, value in layout.items() if value != whole["layout"].get(key)}
     text = json.dumps(whole, cls=PlotlyJSONEncoder, separators=(",", ":"))
-    return Plot(name, title, int(figure.layout.height), int(narrow.layout.height), least_width, packed(text))
+    return Plot(
+        name, title, int(figure.layout.height), int(narrow.layout.height), least_width, gzip_base64(text)
+    )
 
 
 def plot_of(chart: Chart) -> Plot:
@@ -68,7 +70,7 @@ def plot_of(chart: Chart) -> Plot:
     return plot(draw(chart), chart.name, chart.title, draw(chart, NARROW_WIDTH))
 
 
-def packed(text: str) -> str:
+def gzip_base64(text: str) -> str:
     """Return a text as gzip in base64, the same for the same text."""
     return base64.b64encode(gzip.compress(text.encode(), 6, mtime=0)).decode("ascii")
 
@@ -132,4 +134,4 @@ def _policy(*scripts: str) -> str:
 
 @cache
 def _packed_plotly() -> str:
-    return packed(get_plotlyjs())
+    return gzip_base64(get_plotlyjs())

@@ -40,7 +40,7 @@ def write_run_page(run_dir: Path, car: CarConfig) -> str | None:
         from deepracer_exp.analysis.reward_terms import run_terms
         from deepracer_exp.runs.recording import read_run_recording
 
-        from .log_report import LogPage, write_page
+        from .log_report import LogPage, write_log_page
         from .page import Glimpse
 
         view, terms = run_terms(prepare(read_run_recording(run_dir)), car, just_trained=True)
@@ -49,7 +49,7 @@ def write_run_page(run_dir: Path, car: CarConfig) -> str | None:
             from .sight import run_glimpses
 
             view, strip = run_glimpses(view, run_dir, just_trained=True)
-        write_page(run_dir / REPORT, LogPage(view, findings(view), terms=terms, strip=strip))
+        write_log_page(run_dir / REPORT, LogPage(view, findings(view), terms=terms, strip=strip))
     except KeyboardInterrupt:
         return f"{REPORT} was left off; `deepracer-exp analyze {run_dir.name}` writes it"
     except Exception as error:

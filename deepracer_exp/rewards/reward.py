@@ -131,7 +131,7 @@ class RewardFunction:
             rewards[cars] = call(select(columns, cars), track_params, track_of, cars.tolist())
         return rewards
 
-    def pay(self, params: dict[str, Any]) -> float:
+    def compute(self, params: dict[str, Any]) -> float:
         """Return the reward of the first car's module (`scalar`) for given params; call it inside a `Guard`.
 
         Raises:

@@ -121,7 +121,7 @@ def remove(item: Removable) -> bool:
         folder.release()
 
 
-def total(items: Sequence[Removable]) -> int:
+def total_bytes(items: Sequence[Removable]) -> int:
     """Return the total size in bytes."""
     return sum(item.size for item in items)
 

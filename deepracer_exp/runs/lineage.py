@@ -88,7 +88,7 @@ def refuse_other_networks(parent: Experiment, clone: Experiment) -> None:
 
 
 @dataclass
-class Member:
+class FamilyMember:
     """A run of the family."""
 
     name: str
@@ -100,7 +100,7 @@ class Member:
     generation: int
     result: RunResult | None
     """None: not known."""
-    children: "list[Member]" = field(default_factory=list)
+    children: "list[FamilyMember]" = field(default_factory=list)
     changes: dict[str, tuple[Any, Any]] = field(default_factory=dict)
     """Values that differ from the parent's, by dotted key: the parent's and its own."""
 
@@ -109,14 +109,14 @@ class Member:
         """Name of the track, or of several."""
         return "" if self.record is None else course_names(self.record.config.get("track"))
 
-    def walk(self) -> "Iterator[Member]":
+    def walk(self) -> "Iterator[FamilyMember]":
         """Return the member and all below it, parents first."""
         yield self
         for child in self.children:
             yield from child.walk()
 
 
-def family(run: Path, runs_dir: Path) -> Member:
+def family(run: Path, runs_dir: Path) -> FamilyMember:
     """Return the root of a run's family tree.
 
     Relatives are searched in `runs_dir` and beside the run.
@@ -148,7 +148,7 @@ def family(run: Path, runs_dir: Path) -> Member:
     return _grow(root, children, lineages)
 
 
-def best_members(root: Member) -> dict[int, str]:
+def best_members(root: FamilyMember) -> dict[int, str]:
     """Return the best of the family by `id`, with what it is the best by: of each track and measure.
 
     Where a run was evaluated, those that were not are out.
@@ -164,7 +164,7 @@ def best_members(root: Member) -> dict[int, str]:
     return words
 
 
-def best_by_generation(root: Member) -> list[tuple[int, Member, RunResult]]:
+def best_by_generation(root: FamilyMember) -> list[tuple[int, FamilyMember, RunResult]]:
     """Return the best member of each generation on each track and measure; evaluated ones before others."""
     known = [((one.generation, one.course), one, one.result) for one in root.walk() if one.result is not None]
     evaluated = {place for place, _, result in known if result.evaluated}
@@ -173,10 +173,10 @@ def best_by_generation(root: Member) -> list[tuple[int, Member, RunResult]]:
 
 
 def _best_of_groups(
-    members: Iterable[tuple[_Place, Member, RunResult]],
-) -> dict[tuple[_Place, str], tuple[Member, RunResult]]:
+    members: Iterable[tuple[_Place, FamilyMember, RunResult]],
+) -> dict[tuple[_Place, str], tuple[FamilyMember, RunResult]]:
     """Return the best by place and measure, the first of equals."""
-    found: dict[tuple[_Place, str], tuple[Member, RunResult]] = {}
+    found: dict[tuple[_Place, str], tuple[FamilyMember, RunResult]] = {}
     for place, member, result in members:
         key = place, result.measure
         if key not in found or result.rank > found[key][1].rank:
@@ -191,7 +191,9 @@ def _parent(lineage: Lineage, places: list[Path]) -> Path:
     return next((path for path in (recorded, *moved) if is_run(path)), recorded).resolve()
 
 
-def _grow(root: Path, children: Mapping[Path, set[Path]], lineages: Mapping[Path, Lineage | None]) -> Member:
+def _grow(
+    root: Path, children: Mapping[Path, set[Path]], lineages: Mapping[Path, Lineage | None]
+) -> FamilyMember:
     """Return a member with all that descend from it."""
     below = [_grow(child, children, lineages) for child in sorted(children.get(root, ()))]
     lineage = lineages.get(root)
@@ -207,7 +209,7 @@ def _grow(root: Path, children: Mapping[Path, set[Path]], lineages: Mapping[Path
             found = run_differences([record, child.record])
             child.changes = {key: (a, b) for key, (a, b) in found.items() if key not in _IGNORED}
     result = None if record is None else read_result(root)
-    return Member(root.name, root, record, lineage, generation, result, below)
+    return FamilyMember(root.name, root, record, lineage, generation, result, below)
 
 
 def run_differences(records: Sequence[RunRecord]) -> dict[str, list[Any]]:

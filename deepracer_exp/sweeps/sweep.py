@@ -27,7 +27,7 @@ from deepracer_exp.config.sweep import SweepConfig, SweepRequest
 from deepracer_exp.env.real_car import require_car
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.evaluation.evaluator import Evaluator, OnStep
-from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, Group
+from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, TrialGroup
 from deepracer_exp.lookup.resolve import resolve
 from deepracer_exp.rewards.reward import RewardFunction
 from deepracer_exp.runs.checkpoints import read_checkpoint
@@ -55,7 +55,7 @@ from .report.best import (
     write_best,
 )
 from .report.view import SweepView
-from .search.objectives import cost, values_of, without_lap
+from .search.objectives import cost, objective_values, without_lap
 from .search.pruners import build_pruner
 from .search.samplers import build_sampler
 from .search.space import SearchSpace
@@ -328,7 +328,7 @@ def rerank(
 def interval_of(evaluations: Sequence[Evaluation], objective: str, trial_time_s: float) -> list[float]:
     """Return the bootstrap interval of an objective; trials are resampled within evaluation, track and condition.
 
-    The race score counts the laps of all conditions, the other objectives those of the usual ones (`values_of`).
+    The race score counts the laps of all conditions, the other objectives those of the usual ones (`objective_values`).
     `trial_time_s` is the longest that a trial of an evaluation may take.
     """
     rng = np.random.default_rng(0)
@@ -347,7 +347,7 @@ def interval_of(evaluations: Sequence[Evaluation], objective: str, trial_time_s:
 
 
 def _draws(
-    groups: Sequence[Group], objective: str, trial_time_s: float, rng: np.random.Generator
+    groups: Sequence[TrialGroup], objective: str, trial_time_s: float, rng: np.random.Generator
 ) -> "np.ndarray[Any, np.dtype[np.float64]]":
     """Return the objective's value on one track in each resample, (n,)."""
     if objective == "zigzag":
@@ -361,7 +361,7 @@ def _draws(
 
 
 def _zigzag_draws(
-    groups: Sequence[Group], rng: np.random.Generator
+    groups: Sequence[TrialGroup], rng: np.random.Generator
 ) -> "np.ndarray[Any, np.dtype[np.float64]]":
     """Return changes of steering a metre in each resample of the trials, (n,)."""
     zigzags = [one for group in groups for one in group.zigzags]
@@ -371,7 +371,7 @@ def _zigzag_draws(
 
 
 def _resampled(
-    group: Group, objective: str, rng: np.random.Generator
+    group: TrialGroup, objective: str, rng: np.random.Generator
 ) -> "np.ndarray[Any, np.dtype[np.float64]]":
     """Return laps tried, complete laps, counted time and progress in each resample of the trials, (4, n)."""
     column = {trial: at for at, trial in enumerate(group.trials)}
@@ -395,7 +395,7 @@ def _reranked(
     held_out = [one.on(HELD_OUT).completion for one in driven if HELD_OUT in one.conditions]
     return FreshLaps(
         trial=number,
-        values=np.mean([values_of(one, objectives, trial_time_s) for one in driven], axis=0).tolist(),
+        values=np.mean([objective_values(one, objectives, trial_time_s) for one in driven], axis=0).tolist(),
         interval=interval_of(driven, objectives[0], trial_time_s),
         lap_time_s=float(np.mean(times)) if times else None,
         completion=float(np.mean([one.on(USUAL).completion for one in driven])),

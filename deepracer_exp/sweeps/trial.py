@@ -110,7 +110,7 @@ class Trial:
         """Return what Optuna stores of an ended trial: its runs, and what they say together."""
         names = ("ending", "reason", "env_steps", "wall_clock_s", "lap_time_s", "completion")
         together = {name: getattr(self, name) for name in (*names, "held_out_completion")}
-        return {"runs": as_json(self.runs), **together}
+        return {"runs": runs_as_json(self.runs), **together}
 
     def _mean(self, value: Callable[[SeedRun], float | None]) -> float | None:
         values = [found for run in self.runs if (found := value(run)) is not None]
@@ -118,10 +118,10 @@ class Trial:
 
 
 def as_runs(stored: Iterable[Mapping[str, Any]]) -> tuple[SeedRun, ...]:
-    """Return the runs that `as_json` has made plain."""
+    """Return the runs that `runs_as_json` has made plain."""
     return tuple(SeedRun(**run) for run in stored)
 
 
-def as_json(runs: Iterable[SeedRun]) -> list[dict[str, Any]]:
+def runs_as_json(runs: Iterable[SeedRun]) -> list[dict[str, Any]]:
     """Return runs as plain Python, for a database."""
     return [asdict(run) for run in runs]

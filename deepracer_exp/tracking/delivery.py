@@ -13,7 +13,7 @@ from deepracer_exp.runs.result import FAILED, FINISHED, STOPPED_EARLY
 from .calls import StoreRefusedError, StoreUnavailableError
 from .metadata import NAME, USER_NOTE, label_tags
 from .metrics import now_ms, points_at
-from .projection import Projection
+from .projection import MLflowProjection
 from .store import has_store, open_client, resolve_store
 from .tracking_file import Status, TrackingFile, read_tracked_run
 
@@ -45,7 +45,7 @@ def deliver(run_dir: Path, uri: str | None, runs_dir: Path) -> int:
     file = TrackingFile(run_dir, read_tracked_run(run_dir / TRACKING), store.shown)
     if file.run.status is None:  # killed before it noted its end
         file.change(status=ENDS.get(summary["status"], "KILLED"), end_ms=now_ms())
-    projection = Projection(store, file)
+    projection = MLflowProjection(store, file)
     try:
         refused = projection.update()
     except StoreUnavailableError as error:

@@ -17,7 +17,7 @@ from deepracer_exp.config.running import WandbTracking
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.files import TENSORBOARD, WANDB
 
-from .metrics import values_of
+from .metrics import recordable_values
 from .tracker import FINISH_S, Tracker
 from .tracking_file import Status, TrackedRun
 
@@ -45,7 +45,7 @@ class TensorBoardTracker(Tracker):
 
     @override
     def log(self, metrics: Mapping[str, float | None], step: int) -> None:
-        for key, value in values_of(metrics).items():
+        for key, value in recordable_values(metrics).items():
             self._logger.log_scalar(key, value, step=step)
 
     @override
@@ -110,7 +110,7 @@ class WandbTracker(Tracker):
     @override
     def log(self, metrics: Mapping[str, float | None], step: int) -> None:
         if step >= self._first_step:
-            self._held.append((step, values_of(metrics)))
+            self._held.append((step, recordable_values(metrics)))
 
     @override
     def safe_until(self, step: int) -> None:

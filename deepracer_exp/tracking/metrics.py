@@ -175,10 +175,10 @@ def points_of(row: Mapping[str, float | None], step: int, start_ms: int) -> tupl
     """
     clock_s = row.get("wall_clock_s")
     time_ms = now_ms() if clock_s is None else start_ms + round(1000 * clock_s)
-    return points_at(values_of(row), step, time_ms)
+    return points_at(recordable_values(row), step, time_ms)
 
 
-def values_of(row: Mapping[str, float | None]) -> dict[str, float]:
+def recordable_values(row: Mapping[str, float | None]) -> dict[str, float]:
     """Return the values of a row of metrics.jsonl by MLflow's names, without None, NaN and infinite values."""
     named = metric_names({key: value for key, value in row.items() if key != "env_steps"})
     return {key: value for key, value, *_ in points_at(named, 0, 0)}

@@ -9,7 +9,7 @@ from typing_extensions import override
 
 from .metadata import END_TAG
 from .metrics import now_ms, points_of
-from .projection import Projection
+from .projection import MLflowProjection
 from .store import Store
 from .store_thread import StoreThread
 from .tracker import FINISH_S, Tracker
@@ -27,7 +27,7 @@ class MLflowTracker(Tracker):
     def __init__(self, store: Store) -> None:
         self._store = store
         self._file: TrackingFile
-        self._projection: Projection
+        self._projection: MLflowProjection
         self._thread: StoreThread
 
     @property
@@ -46,7 +46,7 @@ class MLflowTracker(Tracker):
         tags = {key: value for key, value in run.tags.items() if key != END_TAG}
         again = replace(run, status=None, end_ms=None, complete=False, tags=tags)
         self._file = TrackingFile(folder, again, self._store.shown)
-        self._projection = Projection(self._store, self._file)
+        self._projection = MLflowProjection(self._store, self._file)
         self._thread = StoreThread(self._projection.update, self._store.shown, "the training continues")
 
     @override

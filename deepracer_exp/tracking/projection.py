@@ -46,7 +46,7 @@ def files_to_keep(run_dir: Path) -> list[tuple[Path, str | None]]:
     return [(path, folder) for path, folder in files if path.exists()]
 
 
-class Projection:
+class MLflowProjection:
     """The MLflow run of a run folder.
 
     A row of metrics.jsonl is written once a checkpoint covers it, so that no resumed run contradicts it, or once the

@@ -123,7 +123,7 @@ def store_run(
     return trainer.end(FINISHED, reason, 0)
 
 
-def resume(
+def resume_training(
     run_dir: Path,
     overrides: Sequence[str],
     console: Console | None = None,

@@ -87,7 +87,7 @@ class Probe:
                     guard.restart()
                     self.calls += 1
                     try:
-                        answers.append(Answer(self._function.pay(params)))
+                        answers.append(Answer(self._function.compute(params)))
                     except RewardFailed as error:
                         self.hangs = error.hung
                         self.failures.append((error.what, error.params or {}))

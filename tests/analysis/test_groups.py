@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepracer_exp.analysis.charts.groups import best_checkpoints, learning_curves
+from deepracer_exp.analysis.charts.groups import best_checkpoints, learning_curve_charts
 from deepracer_exp.analysis.charts.layout import draw
 from deepracer_exp.analysis.evidence import SAME, TOO_FEW, estimate
-from deepracer_exp.analysis.group_curves import curve, curves_table
-from deepracer_exp.analysis.group_tables import as_json, differences_table, scored, sentences
-from deepracer_exp.analysis.groups import Group, compared, group_runs
+from deepracer_exp.analysis.group_curves import curves_table, group_curve
+from deepracer_exp.analysis.group_tables import differences_table, groups_as_json, scored, sentences
+from deepracer_exp.analysis.groups import RunGroup, compared, group_runs
 from deepracer_exp.runs.files import RunRecord, read_record
 
 from .chart_layers import layers
@@ -23,7 +23,7 @@ def alone(records: list[RunRecord]) -> list[tuple[None, RunRecord]]:
 
 
 @pytest.fixture
-def two(tmp_path: Path) -> list[Group]:
+def two(tmp_path: Path) -> list[RunGroup]:
     """Two groups of five seeds on two tracks; the second is faster by far on both."""
     records = []
     for track, length in (("reinvent_base", 1.0), ("Oval_track", 2.0)):
@@ -103,17 +103,17 @@ def test_seeds_that_overlap_and_few_of_them_are_called_that(tmp_path):
     fast = made_up_seeds(tmp_path, ["algorithm.lr=1e-3"], 7.97)
     groups = group_runs(alone([*slow, *fast]))
     assert compared(groups)[0].verdict == SAME
-    few = [Group(group.name, group.records[:2]) for group in groups]
+    few = [RunGroup(group.name, group.records[:2]) for group in groups]
     assert compared(few)[0].verdict == TOO_FEW
 
 
 def test_runs_without_a_lap_are_slower_than_any_and_those_without_a_result_are_left_out(tmp_path):
     groups = [
-        Group("laps", tuple(made_up_seeds(tmp_path, ["algorithm.lr=1e-4"], 8.0))),
-        Group("none", tuple(made_up_run(tmp_path / f"none{k}", [f"seed={k}"], None) for k in range(5))),
+        RunGroup("laps", tuple(made_up_seeds(tmp_path, ["algorithm.lr=1e-4"], 8.0))),
+        RunGroup("none", tuple(made_up_run(tmp_path / f"none{k}", [f"seed={k}"], None) for k in range(5))),
     ]
     (tmp_path / "none4" / "summary.json").unlink()
-    groups[1] = Group("none", (*groups[1].records[:4], read_record(tmp_path / "none4")))
+    groups[1] = RunGroup("none", (*groups[1].records[:4], read_record(tmp_path / "none4")))
     assert scored(groups).rows[1][-1] == "no lap (no lap to no lap)"
     lap = compared(groups)[0]
     assert (lap.difference.iqm, lap.verdict) == (None, "slower")
@@ -128,10 +128,10 @@ def test_different_conditions_are_said_to_be_different(tmp_path):
 
 
 def test_a_curve_keeps_its_last_value_and_ends_with_its_run(tmp_path):
-    group = Group(
+    group = RunGroup(
         "a", (made_up_run(tmp_path / "long", evaluations=5), made_up_run(tmp_path / "short", evaluations=3))
     )
-    table = curve(group, "eval_lap_time_s")
+    table = group_curve(group, "eval_lap_time_s")
     assert table["env_steps"].tolist() == [1000, 2000, 3000, 4000, 5000]
     # The short run falls by a second, too: 10, 9, 8 beside 12, 11, 10, 9, 8.
     assert table["iqm"].tolist() == [11.0, 10.0, 9.0, 9.0, 8.0]
@@ -140,7 +140,7 @@ def test_a_curve_keeps_its_last_value_and_ends_with_its_run(tmp_path):
 
 
 def test_curves_have_bands_over_seeds_and_gaps_where_no_lap_was_completed(two, tmp_path):
-    charts = learning_curves(two)
+    charts = learning_curve_charts(two)
     assert [chart.name for chart in charts] == ["learning_curves_reinvent_base", "learning_curves_Oval_track"]
     panel = charts[0].rows[0][0]
     assert panel.title == "Lap of the evaluated policy, usual conditions"
@@ -148,8 +148,8 @@ def test_curves_have_bands_over_seeds_and_gaps_where_no_lap_was_completed(two, t
     assert [line.name for line in layers(panel, "line")] == [group.name for group in two]
     np.testing.assert_allclose(layers(panel, "line")[1].y, [12, 11, 10, 9, 8], rtol=1e-6)
     assert "over 5 runs" in charts[0].caption
-    none = Group("none", (made_up_run(tmp_path / "none", lap_s=None),))
-    (chart,) = learning_curves([none])
+    none = RunGroup("none", (made_up_run(tmp_path / "none", lap_s=None),))
+    (chart,) = learning_curve_charts([none])
     titles = [panel.title for row in chart.rows for panel in row]
     assert titles == ["Completion of the evaluated policy", "Completion in training", "Return of an episode"]
     assert draw(chart).data
@@ -159,12 +159,12 @@ def test_runs_on_several_tracks_at_once_have_the_mean_of_their_training_laps(tmp
     record = made_up_run(tmp_path / "run")
     for row in record.rows:
         row |= {"mean_lap_time_s": None, "mean_lap_time_s/A": 8.0, "mean_lap_time_s/B": 12.0}
-    table = curve(Group("a", (record,)), "mean_lap_time_s")
+    table = group_curve(RunGroup("a", (record,)), "mean_lap_time_s")
     assert set(table["iqm"]) == {10.0}
 
 
 def test_what_is_exported_is_json_and_has_all_curves(two):
-    found = json.loads(json.dumps(as_json(two, compared(two)), allow_nan=False))
+    found = json.loads(json.dumps(groups_as_json(two, compared(two)), allow_nan=False))
     assert [group["track"] for group in found["groups"]] == ["reinvent_base", "Oval_track"] * 2
     assert found["groups"][0]["figures"]["lap_time_s"]["iqm"] == pytest.approx(9.0)
     assert found["differences"][0]["verdict"] == "faster"

@@ -7,7 +7,7 @@ import pytest
 
 from deepracer_exp.analysis.findings import findings
 from deepracer_exp.analysis.log_view import prepare
-from deepracer_exp.analysis.zigzag import CENTRED_DEG, ZigZag, total, zigzag_in, zigzag_of
+from deepracer_exp.analysis.zigzag import CENTRED_DEG, ZigZag, total_zigzag, zigzag_in, zigzag_of
 from deepracer_exp.tracks.track import Track
 
 from .made_up import Drive, made_up_course, made_up_recording
@@ -116,10 +116,10 @@ def test_parts_add_up_to_the_whole(straight):
     steering_deg, number = swinging(20.0), np.arange(STEPS) // 40
     parts = [measure(straight, steering_deg[number == one], number=number[number == one]) for one in range(3)]
     whole = measure(straight, steering_deg, number=number)
-    assert total(parts).changes == whole.changes > 0
+    assert total_zigzag(parts).changes == whole.changes > 0
     for name in ("straight_m", "laps", "swings_deg"):
-        assert getattr(total(parts), name) == pytest.approx(getattr(whole, name))
-    assert total([]) == ZigZag()
+        assert getattr(total_zigzag(parts), name) == pytest.approx(getattr(whole, name))
+    assert total_zigzag([]) == ZigZag()
 
 
 def swerving_view(angle_deg: float, stream: str = "training"):

@@ -15,7 +15,7 @@ from benchmarks.same import different_rows
 from benchmarks.sweep_runs import Course, Ended, Pace, makespan_s, replay
 from deepracer_exp.config.compose import compose_evaluation
 from deepracer_exp.config.sweep import compose_sweep
-from deepracer_exp.sweeps.trial import SeedRun, as_json
+from deepracer_exp.sweeps.trial import SeedRun, runs_as_json
 
 PACE = Pace(step_s=0.01, trial_s=5.0)
 STEPS = 1000
@@ -123,7 +123,7 @@ def test_a_trial_that_reported_something_else_than_its_complete_run_is_refused()
     whole = course(0, [12.0, 10.0, 9.0, 8.0])
 
     def trial(reports: dict[int, float]) -> FrozenTrial:
-        runs = as_json([SeedRun(seed=0, env_steps=2500, ending="collapsed")])
+        runs = runs_as_json([SeedRun(seed=0, env_steps=2500, ending="collapsed")])
         return create_trial(state=TrialState.PRUNED, intermediate_values=reports, user_attrs={"runs": runs})
 
     sweep_runs.hold_against(trial({1: 12.0, 2: 10.0}), whole)
@@ -135,9 +135,9 @@ def test_a_trial_that_reported_something_else_than_its_complete_run_is_refused()
 def test_the_pace_is_that_of_all_steps_and_of_the_usual_trial() -> None:
     def trial(env_steps: int, wall_clock_s: float, took_s: float) -> FrozenTrial:
         run = SeedRun(seed=0, env_steps=env_steps, wall_clock_s=wall_clock_s, took_s=took_s)
-        return create_trial(value=1.0, user_attrs={"runs": as_json([run])})
+        return create_trial(value=1.0, user_attrs={"runs": runs_as_json([run])})
 
-    failed = create_trial(state=TrialState.FAIL, user_attrs={"runs": as_json([SeedRun(seed=0)])})
+    failed = create_trial(state=TrialState.FAIL, user_attrs={"runs": runs_as_json([SeedRun(seed=0)])})
     found = sweep_runs.pace_of(
         [trial(1000, 10.0, 14.0), trial(3000, 20.0, 26.0), trial(2000, 30.0, 20.0), failed]
     )

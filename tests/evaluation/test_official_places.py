@@ -7,7 +7,7 @@ import pytest
 
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.evaluation.evaluate import official_places
-from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, Group
+from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, TrialGroup
 from deepracer_exp.lookup.next_steps import official_place
 from deepracer_exp.runs.files import RunRecord
 from deepracer_exp.tracks import boards
@@ -18,12 +18,12 @@ from .test_result import attempt
 LAPS = ("track=Straight_track", "action_space=deepracer", "reward=speed_on_track", "budget.env_steps=16384")
 
 
-def driven(track: str, *times_s: float, condition: str = USUAL) -> Group:
+def driven(track: str, *times_s: float, condition: str = USUAL) -> TrialGroup:
     laps = [attempt(trial, time_s=time_s) for trial, time_s in enumerate(times_s)]
-    return Group(track, condition, tuple(range(len(times_s))), tuple(laps))
+    return TrialGroup(track, condition, tuple(range(len(times_s))), tuple(laps))
 
 
-def places(*groups: Group, overrides: tuple[str, ...] = (), **protocol: object) -> dict:
+def places(*groups: TrialGroup, overrides: tuple[str, ...] = (), **protocol: object) -> dict:
     experiment, _ = compose_experiment([f"track={groups[0].track}", *overrides])
     config = dataclasses.replace(experiment.evaluation, **protocol)
     return official_places(experiment, config, Evaluation(groups))

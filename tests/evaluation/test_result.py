@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deepracer_exp.evaluation.race_protocol import Attempt
-from deepracer_exp.evaluation.result import Evaluation, Group
+from deepracer_exp.evaluation.result import Evaluation, TrialGroup
 
 
 def attempt(trial=0, time_s=10.0, progress=100.0, end=None, **more):
@@ -15,7 +15,7 @@ def attempt(trial=0, time_s=10.0, progress=100.0, end=None, **more):
 
 def group(*attempts, track="a", condition="usual"):
     """Return attempts of as many trials as they name."""
-    return Group(track, condition, tuple(sorted({a.trial for a in attempts})), attempts)
+    return TrialGroup(track, condition, tuple(sorted({a.trial for a in attempts})), attempts)
 
 
 @settings(max_examples=15, deadline=None)

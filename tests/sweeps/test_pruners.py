@@ -9,7 +9,7 @@ from optuna.trial import TrialState, create_trial
 from deepracer_exp.config.sweep import SweepConfig
 from deepracer_exp.errors import BadInput
 from deepracer_exp.sweeps.search.pruners import FirstOf, PruneDecision, build_pruner, is_worse_across_seeds
-from deepracer_exp.sweeps.trial import SeedRun, as_json
+from deepracer_exp.sweeps.trial import SeedRun, runs_as_json
 
 from . import studies
 
@@ -112,7 +112,7 @@ def seeded(*trials: Sequence[float], direction: str = "minimize") -> optuna.Stud
     """Return a study of complete trials with these values by seed."""
     study = optuna.create_study(direction=direction)
     for values in trials:
-        runs = as_json(SeedRun(seed=seed, values=[value]) for seed, value in enumerate(values))
+        runs = runs_as_json(SeedRun(seed=seed, values=[value]) for seed, value in enumerate(values))
         study.add_trial(create_trial(value=sum(values) / len(values), user_attrs={"runs": runs}))
     return study
 

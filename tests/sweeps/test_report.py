@@ -8,7 +8,7 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.sweeps.report.labels import short_keys
 from deepracer_exp.sweeps.report.page import study_page, study_summary, write_study_page
 from deepracer_exp.sweeps.report.seeds import over_seeds
-from deepracer_exp.sweeps.trial import SeedRun, as_json
+from deepracer_exp.sweeps.trial import SeedRun, runs_as_json
 from tests.browser import needs_chromium
 from tests.page_html import Html
 
@@ -65,7 +65,9 @@ def test_a_page_of_a_thousand_trials_of_many_parameters_stays_under_three_megaby
     write_metrics(tmp_path / "lr_entropy" / "run-0", 250)
     # All of them have the same curve, which saves a thousand files.
     for trial in study.get_trials(deepcopy=False):
-        trial.user_attrs["runs"] = as_json([SeedRun(seed=0, run_dir=str(tmp_path / "lr_entropy" / "run-0"))])
+        trial.user_attrs["runs"] = runs_as_json(
+            [SeedRun(seed=0, run_dir=str(tmp_path / "lr_entropy" / "run-0"))]
+        )
     html = study_page(study)
     assert len(html.encode()) < 3_000_000
     assert "The last 700 in this order are left out" in Html(html).text

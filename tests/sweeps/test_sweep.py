@@ -12,7 +12,7 @@ from deepracer_exp.config.compose import compose_evaluation, compose_experiment
 from deepracer_exp.config.sweep import compose_sweep
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.evaluation.race_protocol import Attempt
-from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, Group
+from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, TrialGroup
 from deepracer_exp.runs.files import read_object
 from deepracer_exp.sweeps.queue.claims import Claim
 from deepracer_exp.sweeps.queue.driver import Driver
@@ -127,7 +127,7 @@ def test_the_interval_of_a_race_score_holds_the_score_of_all_conditions():
     held_out = [_lap(trial, 8.0) if trial % 2 else _lap(trial, 4.0, 50.0) for trial in range(20, 40)]
     groups = ((USUAL, range(20), usual), (HELD_OUT, range(20, 40), held_out))
     evaluation = Evaluation(
-        tuple(Group("road", where, tuple(trials), tuple(laps)) for where, trials, laps in groups)
+        tuple(TrialGroup("road", where, tuple(trials), tuple(laps)) for where, trials, laps in groups)
     )
     assert evaluation.race_score_s == pytest.approx(8.0)
     low, high = interval_of([evaluation], "race_score", 120.0)

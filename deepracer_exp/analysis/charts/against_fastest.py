@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from deepracer_exp.analysis.against_fastest import CAUSES, in_words, loss
+from deepracer_exp.analysis.against_fastest import CAUSES, loss, lost_in_words
 from deepracer_exp.analysis.log_view import LogView
 
 from .figure import Chart, Panel, bars
@@ -28,8 +28,8 @@ def against_fastest(view: LogView) -> Chart | None:
     return Chart(
         name="against_fastest",
         title="Seconds lost to the fastest lap of this car",
-        caption=f"The fastest {view.lap_word} from the start line: {in_words(found)}. Line is a longer way, steering "
-        "the way that turning to and fro adds to it, speed the rest; below zero the lap gains. The fastest lap itself: "
-        "`deepracer-exp tracks NAME --fastest`.",
+        caption=f"The fastest {view.lap_word} from the start line: {lost_in_words(found)}. Line is a longer way, "
+        "steering the way that turning to and fro adds to it, speed the rest; below zero the lap gains. The fastest "
+        "lap itself: `deepracer-exp tracks NAME --fastest`.",
         rows=[[Panel(layers=layers, y_label="seconds lost", x_names=list(table.index))]],
     )

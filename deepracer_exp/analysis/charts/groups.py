@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from deepracer_exp.analysis.group_curves import CURVES, curve
-from deepracer_exp.analysis.groups import COMPARED, FORMS, Group, courses_of
+from deepracer_exp.analysis.group_curves import CURVES, group_curve
+from deepracer_exp.analysis.groups import COMPARED, FORMS, RunGroup, courses_of
 
 from .figure import Chart, Layer, Panel, band, in_rows, line, points
 from .style import BLUE, CATEGORIES, ORANGE
@@ -21,14 +21,14 @@ _TITLES = {
 """Titles and axes of `CURVES`."""
 
 
-def learning_curves(groups: Sequence[Group]) -> list[Chart]:
+def learning_curve_charts(groups: Sequence[RunGroup]) -> list[Chart]:
     """Draw the learning curves of groups, a chart a track: a group of several seeds as its mean with a band."""
     courses = courses_of(groups)
     charts = [_learning_curves(groups, course, len(courses) > 1) for course in courses]
     return [chart for chart in charts if chart is not None]
 
 
-def _learning_curves(groups: Sequence[Group], course: str, several: bool) -> Chart | None:
+def _learning_curves(groups: Sequence[RunGroup], course: str, several: bool) -> Chart | None:
     here = [(number, own) for number, group in enumerate(groups) if (own := group.on(course)).records]
     longest = max(
         (float(record.rows[-1]["env_steps"]) for _, own in here for record in own.records if record.rows),
@@ -39,7 +39,7 @@ def _learning_curves(groups: Sequence[Group], course: str, several: bool) -> Cha
     for column in CURVES:
         layers: list[Layer] = []
         for number, group in here:
-            table = curve(group, column).replace([np.inf], np.nan)
+            table = group_curve(group, column).replace([np.inf], np.nan)
             if not table["iqm"].notna().any():
                 continue
             color, dashed = CATEGORIES[number % len(CATEGORIES)], number >= len(CATEGORIES)
@@ -74,7 +74,7 @@ def courses_name(course: str) -> str:
     return "".join(letter if letter.isalnum() else "_" for letter in course)
 
 
-def best_checkpoints(groups: Sequence[Group]) -> Chart | None:
+def best_checkpoints(groups: Sequence[RunGroup]) -> Chart | None:
     """Draw the figures of each run's best checkpoint by group and track, with their interquartile mean and interval."""
     places = [(group, course) for group in groups for course in group.courses]
     several = len(courses_of(groups)) > 1

@@ -26,7 +26,7 @@ def training_progress(view: LogView) -> Chart | None:
     found = convergence(table, view.action_count, view.stopping)
     at = None if found is None else found.iteration
     converged = [] if at is None else [mark(at, "converged", FAINT)]
-    progress = curve(table, "completion_mean", BLUE, "mean of the episodes")
+    progress = curve_layers(table, "completion_mean", BLUE, "mean of the episodes")
     for column, color, name in (
         ("eval_completion", ORANGE, "evaluation after the update"),
         ("held_out_completion", VERMILION, "held-out conditions"),
@@ -35,9 +35,9 @@ def training_progress(view: LogView) -> Chart | None:
             progress += _joined(table, column, color, name)
     shares = table.assign(lap_share=100 * table["lap_share"])
     shown = [
-        ("Reward", "reward of an episode", curve(table, "reward_mean", GREEN, "mean")),
+        ("Reward", "reward of an episode", curve_layers(table, "reward_mean", GREEN, "mean")),
         ("Progress", "per cent of the lap", progress),
-        ("Complete laps", "per cent of the episodes", curve(shares, "lap_share", BLUE, "share")),
+        ("Complete laps", "per cent of the episodes", curve_layers(shares, "lap_share", BLUE, "share")),
     ]
     laps = [
         layer
@@ -52,7 +52,7 @@ def training_progress(view: LogView) -> Chart | None:
         shown.append(("Lap times", "lap time, s", laps))
     if table["entropy"].notna().any():
         shown.append(
-            ("Entropy of the policy", "nats", curve(table, "entropy", PURPLE, "mean over the update"))
+            ("Entropy of the policy", "nats", curve_layers(table, "entropy", PURPLE, "mean over the update"))
         )
     when = "It has not converged yet." if at is None else f"It converged at iteration {at}."
     if view.decision is not None:
@@ -91,7 +91,9 @@ def learning_vs_lap_time(view: LogView) -> Chart | None:
     for name in known:
         title, unit, color = metrics[name]
         label = ITERATION if name == known[-1] else ""
-        panels.append(Panel(title=title, x_label=label, y_label=unit, layers=curve(table, name, color, None)))
+        panels.append(
+            Panel(title=title, x_label=label, y_label=unit, layers=curve_layers(table, name, color, None))
+        )
     return Chart(
         name="learning_vs_lap_time",
         title="Metrics of the policy updates and lap times",
@@ -253,7 +255,7 @@ def stability(view: LogView) -> Chart | None:
     )
 
 
-def curve(table: pd.DataFrame, column: str, color: str, name: str | None) -> list[Layer]:
+def curve_layers(table: pd.DataFrame, column: str, color: str, name: str | None) -> list[Layer]:
     """Return a column of a table of iterations as points, and its moving average as a line."""
     shown = subsample(len(table), 1000)
     x, y = table["iteration"].to_numpy()[shown], table[column].to_numpy(np.float64)

@@ -4,7 +4,7 @@ import numpy as np
 
 from deepracer_exp.analysis.log_view import LogView
 from deepracer_exp.analysis.sectors import sectors_of
-from deepracer_exp.analysis.zigzag import CENTRED_DEG, in_words
+from deepracer_exp.analysis.zigzag import CENTRED_DEG, zigzag_in_words
 from deepracer_exp.analysis.zigzag_log import zigzag_now
 
 from .figure import Chart, Layer, Panel, band, line
@@ -41,8 +41,8 @@ def zigzag(view: LogView) -> Chart | None:
         name="zigzag",
         title="Steering along the fastest lap, and the straights",
         caption=f"Commanded steering at each control step, without smoothing; the straights of the centre line are "
-        f"shaded. On these: {in_words(*figures)} ({where}). A line that jumps from one side of zero to the other "
-        "within a shaded part is zig-zag, but for the first time: that is the way from one bend into the next."
+        f"shaded. On these: {zigzag_in_words(*figures)} ({where}). A line that jumps from one side of zero to the "
+        "other within a shaded part is zig-zag, but for the first time: that is the way from one bend into the next."
         + " The lap of a training is one of drawn actions; the policy that races swerves less."
         * view.trained,
         rows=[

@@ -17,7 +17,7 @@ from deepracer_exp.aws.archives import (
     READ_ERRORS,
     ZIP,
     Archive,
-    Member,
+    ArchiveMember,
     members_of,
     natural,
     open_archive,
@@ -240,7 +240,7 @@ class _Archives:
         self._path: Path | None = None
         self._archive: Archive | None = None
 
-    def open(self, path: Path, member: Member) -> IO[bytes]:
+    def open(self, path: Path, member: ArchiveMember) -> IO[bytes]:
         """Open a member for reading; a member of another archive must have been read completely."""
         if self._archive is None or self._path != path:
             self.close()
@@ -300,7 +300,7 @@ def _lies_beside(path: Path, file: LogFile) -> bool:
     """Return whether a member of an archive is also unpacked beside it, with the same name and size."""
     named = (PACKED.sub("", path.name),)
     _, member = file.given
-    assert isinstance(member, Member)
+    assert isinstance(member, ArchiveMember)
     for place in (file.parts, (*named, *file.parts), (*named, *file.parts[1:])):
         with contextlib.suppress(OSError):  # not there, or a name that no file system takes
             if path.parent.joinpath(*place).stat().st_size == member.size:
@@ -327,7 +327,7 @@ def _ending(name: str) -> str | None:
 def _members(path: Path, archive: Archive, archives: _Archives) -> LogFolder:
     """List the members."""
     found = LogFolder()
-    members: dict[tuple[str, ...], Member] = {}
+    members: dict[tuple[str, ...], ArchiveMember] = {}
     try:
         for member in members_of(archive):
             if member.kind == "file":

@@ -21,7 +21,7 @@ from deepracer_exp.aws.archives import (
     READ_ERRORS,
     ZIP,
     Archive,
-    Member,
+    ArchiveMember,
     members_of,
     natural,
     open_archive,
@@ -238,7 +238,7 @@ def _folder(path: str) -> _Files:
 
 def _packed(path: str, archive: Archive) -> _Files:
     """List the files of an archive."""
-    members: dict[str, Member] = {}
+    members: dict[str, ArchiveMember] = {}
     files = _Files(path, lambda name: open_member(archive, members[name]))
     for member in members_of(archive):
         if member.kind == "link":

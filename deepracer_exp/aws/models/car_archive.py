@@ -26,7 +26,7 @@ METADATA, GRAPH = "model_metadata.json", "agent/model.pb"
 Tensors = Mapping[str, NDArray[np.float32]]
 
 
-def packed(files: Mapping[str, bytes]) -> bytes:
+def tar_gz(files: Mapping[str, bytes]) -> bytes:
     """Return a .tar.gz with nothing in it that differs between two exports."""
     out = io.BytesIO()
     with (

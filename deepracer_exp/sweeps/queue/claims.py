@@ -23,7 +23,7 @@ from optuna.storages import BaseStorage
 from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.exc import DBAPIError, IntegrityError
 
-from deepracer_exp.sweeps.trial import SeedRun, Trial, as_json, as_runs
+from deepracer_exp.sweeps.trial import SeedRun, Trial, as_runs, runs_as_json
 
 from .storage import DOWN, patiently
 
@@ -143,7 +143,7 @@ class TrialClaims:
     ) -> bool:
         """Record the runs for a later owner; return False if another worker has taken the trial over."""
         more = {} if progress is None else {_of.progress: json.dumps(dict(progress))}
-        return self._update_held(claim, {_of.runs: json.dumps(as_json(runs)), **more})
+        return self._update_held(claim, {_of.runs: json.dumps(runs_as_json(runs)), **more})
 
     def settle(self, claim: Claim, ended: Trial) -> bool:
         """Store the result of a trial; return False if another worker has taken the trial over.
@@ -153,7 +153,7 @@ class TrialClaims:
         values = {
             _of.state: ended.state,
             _of.objective_values: json.dumps(ended.values),
-            _of.runs: json.dumps(as_json(ended.runs)),
+            _of.runs: json.dumps(runs_as_json(ended.runs)),
         }
         return self._update_held(claim, values, settled=True)
 
@@ -178,7 +178,7 @@ class TrialClaims:
             mine = connection.execute(self._select(*where)).all()
             for row in mine:
                 runs = [run if is_lost else replace(run, tries=0) for run in _runs(row)]
-                values = {_of.expires_s: _RELEASED, _of.runs: json.dumps(as_json(runs))}
+                values = {_of.expires_s: _RELEASED, _of.runs: json.dumps(runs_as_json(runs))}
                 connection.execute(self._statement(values, _of.number == row.number, *where))
         return len(mine)
 

@@ -35,16 +35,16 @@ from deepracer_exp.runs.files import (
 from deepracer_exp.runs.folder import is_held
 from deepracer_exp.runs.lineage import Lineage
 from deepracer_exp.runs.result import FAILED, FINISHED, INTERRUPTED, STOPPED_EARLY
-from deepracer_exp.sweeps.search.objectives import intermediate_value, values_of
+from deepracer_exp.sweeps.search.objectives import intermediate_value, objective_values
 from deepracer_exp.sweeps.search.pruners import FirstOf, PruneDecision, build_pruner, is_worse_across_seeds
 from deepracer_exp.sweeps.search.samplers import build_sampler
-from deepracer_exp.sweeps.trial import SeedRun, Trial, as_json
+from deepracer_exp.sweeps.trial import SeedRun, Trial, runs_as_json
 from deepracer_exp.tracking.metadata import PARENT, STUDY
 from deepracer_exp.tracking.metrics import trial_metrics
 from deepracer_exp.tracking.study_run import TRIAL, end_trial_run, open_trial_run
 from deepracer_exp.tracking.tracking_file import Status
 from deepracer_exp.training.budget import RunEnded
-from deepracer_exp.training.run import copy_run, resume, run_training
+from deepracer_exp.training.run import copy_run, resume_training, run_training
 from deepracer_exp.training.signals import Interruption
 from deepracer_exp.training.trainer import Callback, TakenOver, Trainer, TrainResult
 
@@ -225,7 +225,7 @@ class TrialRun(Callback):
         folder = str(run_dir.resolve())
         self._record(SeedRun(seed=self._seed, run_dir=folder, tries=tried.tries, tried_at=tried.tried_at))
         # The report draws the curves of running trials.
-        self._patiently(lambda: self._trial.set_user_attr("runs", as_json(self._runs)))
+        self._patiently(lambda: self._trial.set_user_attr("runs", runs_as_json(self._runs)))
 
     def _show(self, spent: float, row: dict[str, Any]) -> None:
         """Set what the live view shows, after this share of the present run's budget."""
@@ -346,7 +346,7 @@ class TrialRun(Callback):
             self._begin(run_dir)
         title, tags = self._title_and_tags()
         try:
-            return resume(run_dir, [], None, [self], run_name=title, tags=tags)
+            return resume_training(run_dir, [], None, [self], run_name=title, tags=tags)
         except RunEnded:
             summary = read_object(run_dir / SUMMARY)
             return TrainResult(summary["status"], summary["reason"], 0, run_dir, summary)
@@ -380,7 +380,9 @@ class TrialRun(Callback):
         usual = evaluation.on(USUAL)
         held_out = evaluation.on(HELD_OUT).completion if HELD_OUT in evaluation.conditions else None
         return {
-            "values": values_of(evaluation, self._config.config.objectives, self._config.protocol.time_s),
+            "values": objective_values(
+                evaluation, self._config.config.objectives, self._config.protocol.time_s
+            ),
             "lap_time_s": usual.mean_lap_time_s,
             "completion": usual.completion,
             "held_out_completion": held_out,

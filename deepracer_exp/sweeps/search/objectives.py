@@ -81,7 +81,7 @@ def cost(objectives: Sequence[str], values: Sequence[float]) -> float:
     return by_name["lap_time"] / max(by_name.get("completion", 100.0) / 100, _LEAST_SHARE)
 
 
-def values_of(evaluation: "Evaluation", objectives: Sequence[str], trial_time_s: float) -> list[float]:
+def objective_values(evaluation: "Evaluation", objectives: Sequence[str], trial_time_s: float) -> list[float]:
     """Return the values of the objectives, means over tracks; all but the race score of the usual conditions.
 
     A policy without a complete lap gets more seconds than `trial_time_s`, the longest that a trial of the evaluation
