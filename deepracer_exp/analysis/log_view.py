@@ -23,14 +23,8 @@ from .log_course import (
     numbered_as_logged,
     was_driven_on,
 )
-from .tables import (
-    add_derived,
-    candidates,
-    episode_table,
-    first_rows,
-    iteration_table,
-    timed_by_service,
-)
+from .step_columns import add_derived, first_rows, timed_by_service
+from .tables import candidates, episode_table, iteration_table
 
 DISCOUNT = Hyperparameters().discount_factor
 """For logs without hyperparameters: the service's default."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from .racing_line import WHEELBASE_M
 from .statistics import Values, wilson
-from .tables import first_rows
+from .step_columns import first_rows
 
 Rows = NDArray[np.intp]
 PLACE_M = 1.5

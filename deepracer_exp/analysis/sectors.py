@@ -13,7 +13,7 @@ from deepracer_exp.tracks.track import Track
 from .log_course import waypoint_positions
 from .log_view import LEAST_LAPS, LogView
 from .statistics import Values
-from .tables import first_rows, laps_driven
+from .step_columns import first_rows, laps_driven
 
 BEND_PM = 0.3
 """Curvature from which on the centre line counts as a bend, 1/m: radii below 3.3 m."""

@@ -12,7 +12,7 @@ from deepracer_exp.tracks.track import Track
 
 from .sectors import sector_at, sectors_of
 from .statistics import Values
-from .tables import STILL_M, first_rows
+from .step_columns import STILL_M, first_rows
 
 CENTRED_DEG = 2.0
 """Steering below which the wheels count as straight: less than the smallest angle of usual action spaces."""

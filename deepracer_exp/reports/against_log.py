@@ -18,7 +18,8 @@ from deepracer_exp.analysis.log_tables import NONE, Table, facts, problem_rows
 from deepracer_exp.analysis.log_view import DISCOUNT, PREPARE, LogView
 from deepracer_exp.analysis.sectors import interval_times, sector_at, sectors_of
 from deepracer_exp.analysis.statistics import Values, totals
-from deepracer_exp.analysis.tables import add_derived, episode_table, first_rows
+from deepracer_exp.analysis.step_columns import add_derived, first_rows
+from deepracer_exp.analysis.tables import episode_table
 from deepracer_exp.aws.logs.recording import STEP_COLUMNS
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.files import atomic_write

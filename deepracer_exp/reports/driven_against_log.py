@@ -12,7 +12,7 @@ from torch import nn
 from deepracer_exp.analysis.log_course import catalogue_track, directed, numbered_as_logged, was_driven_on
 from deepracer_exp.analysis.log_view import LogView
 from deepracer_exp.analysis.statistics import subsample
-from deepracer_exp.analysis.tables import first_rows, flying_rows
+from deepracer_exp.analysis.step_columns import first_rows, flying_rows
 from deepracer_exp.aws.logs.recording import STEP_COLUMNS
 from deepracer_exp.aws.worlds.catalogue import find_world
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment

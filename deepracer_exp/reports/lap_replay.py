@@ -16,7 +16,7 @@ from deepracer_exp.analysis.line_file import driven_speed_mps
 from deepracer_exp.analysis.log_tables import Table
 from deepracer_exp.analysis.log_view import LogView
 from deepracer_exp.analysis.statistics import Values
-from deepracer_exp.analysis.tables import first_rows
+from deepracer_exp.analysis.step_columns import first_rows
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import atomic_write
 from deepracer_exp.tracks.track import Track

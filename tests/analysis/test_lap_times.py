@@ -13,7 +13,8 @@ import pytest
 from deepracer_exp.analysis.charts.run_pictures import episodes as pictured
 from deepracer_exp.analysis.log_tables import facts
 from deepracer_exp.analysis.log_view import LogView, prepare
-from deepracer_exp.analysis.tables import add_derived, episode_table
+from deepracer_exp.analysis.step_columns import add_derived
+from deepracer_exp.analysis.tables import episode_table
 from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.aws.logs.recording import TRAINING, Recording
 from deepracer_exp.env.rules import lap_clock_s

@@ -8,7 +8,8 @@ import pandas as pd
 import pytest
 
 from deepracer_exp.analysis.log_view import LogView, prepare
-from deepracer_exp.analysis.tables import DERIVED_COLUMNS, EPISODE_COLUMNS, ITERATION_COLUMNS
+from deepracer_exp.analysis.step_columns import DERIVED_COLUMNS
+from deepracer_exp.analysis.tables import EPISODE_COLUMNS, ITERATION_COLUMNS
 from deepracer_exp.aws.logs.recording import STEP_COLUMNS
 
 from .made_up import Drive, made_up_course, made_up_recording

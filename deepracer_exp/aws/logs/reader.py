@@ -1,8 +1,7 @@
 """Reads recordings of trainings and races from folders, archives and single files, in all layouts of the service."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,32 +12,25 @@ from deepracer_exp.aws.archives import natural
 from deepracer_exp.errors import BadInput
 
 from .drives import (
-    EPISODES_PER_ITERATION,
     Drives,
-    Ints,
     Rows,
     checkpoint_number,
     concatenated,
     first_checkpoint,
-    in_degrees,
-    iterations_of,
     number_episodes,
-    repeated,
-    rows_also_in,
     steps_of,
 )
 from .files import (
     PACKED,
     LogFile,
-    Place,
     label,
     log_folder,
     named_parts,
     place_of,
     same_job,
-    without_worker,
 )
-from .parts import Parts, TraceFile, read_parts
+from .joining import JoinedSteps, log_place, uppermost
+from .parts import Parts, read_parts
 from .recording import (
     METRICS_COLUMNS,
     TRAINING,
@@ -49,10 +41,9 @@ from .recording import (
     readable,
     typed_table,
 )
-from .text_log import TrainingLog, Update, join_rolled
+from .text_log import TrainingLog, Update
 
 _KINDS = (TRAINING, "evaluation", "leaderboard")
-_NEARLY = 0.75
 Numbers = Mapping[tuple[int, int, int], int]
 
 
@@ -93,30 +84,15 @@ def _counted_checkpoints(steps: pd.DataFrame) -> dict[int, str]:
 
 
 class _Assembly:
-    """Joins the parts of a recording."""
+    """Numbers the rounds, iterations and episodes of a recording, and puts its tables together."""
 
     def __init__(self, parts: Parts) -> None:
-        self.parts = parts
-        self.problems = list(parts.problems)
-        # Of several files of settings the one nearest to the top is used, files before logs.
-        self.settings = _uppermost(parts.hyperparameters) or {}
+        joined = JoinedSteps(parts)
+        self.parts, self.problems, self.settings = parts, joined.problems, joined.settings
+        self.logs, self.drives = joined.logs, joined.drives
+        self.roots, self.copies = joined.roots, joined.copies
         self.iteration_of: dict[int, int] = {}
         """Iteration of each training episode of the recording."""
-        self.logs = join_rolled(parts.logs)
-        self.drives = list(self._drives_of_csv())
-        self.roots: dict[int, tuple[str, ...]] = {}
-        self.jobs: dict[tuple[str, ...], tuple[str, ...]] = {}
-        """Folder of the CSVs by the root of the text logs of the same training."""
-        self.copies: dict[tuple[str, ...], Drives] = {}
-        """Copies of other trainings, by their folders."""
-        # A log of 2019 repeats lines of the training's under the name of an evaluation.
-        for number in sorted(range(len(self.logs)), key=lambda at: _place(*self.logs[at]).kind != TRAINING):
-            self._add_log(number, *self.logs[number])
-        for one in self.drives:
-            one.place = replace(one.place, root=self.jobs.get(one.place.root, one.place.root))
-        self.roots = {number: self.jobs.get(root, root) for number, root in self.roots.items()}
-        self._without_copies()
-        self._without_repeats()
         self.training = [one for one in self.drives if one.place.kind == TRAINING]
         self.rounds = sorted(
             {one.place.root for one in self.training}, key=lambda root: natural("/".join(root))
@@ -142,121 +118,15 @@ class _Assembly:
             steps=steps,
             updates=self._updates(first),
             metrics=self._metrics(numbers, first),
-            metadata=_uppermost(parts.metadata),
+            metadata=uppermost(parts.metadata),
             hyperparameters=self.settings or None,
-            reward_source=_uppermost(parts.reward),
+            reward_source=uppermost(parts.reward),
             track=worlds[0] if worlds else parts.worlds.get(TRAINING),
             problems=tuple(self.problems),
             files=tuple(file.path for file in parts.files),
             checkpoints=dict(sorted((counted | named).items())),
             rounds=tuple(rounds) if len(rounds) > 1 else (),
         )
-
-    @property
-    def _per_iteration(self) -> int:
-        return int(self.settings.get("num_episodes_between_training", EPISODES_PER_ITERATION))
-
-    def _drives_of_csv(self) -> Iterable[Drives]:
-        groups: dict[Place, list[TraceFile]] = {}
-        for trace in self.parts.traces:
-            place = trace.place
-            if place.kind == TRAINING:
-                place = replace(place, name=place.root[-1] if place.root else TRAINING)
-            groups.setdefault(place, []).append(trace)
-        for place, traces in groups.items():
-            traces.sort(key=lambda trace: (-1 if trace.number is None else trace.number, trace.file.order))
-            tables = [in_degrees(trace.steps.whole) for trace in traces]
-            iterations = [
-                table["episode"].to_numpy().astype(np.int64) // self._per_iteration
-                if trace.number is None
-                else np.full(len(table), trace.number, np.int64)
-                for trace, table in zip(traces, tables, strict=True)
-            ]
-            world = self.parts.worlds.get(place.kind, "")
-            yield Drives(place, concatenated(tables), np.concatenate(iterations), world, [place.name])
-
-    def _add_log(self, number: int, files: Sequence[LogFile], log: TrainingLog) -> None:
-        """Add the drives of a log, unless they are known already from CSVs or another log."""
-        file, place = files[0], _place(files, log)
-        if place.kind == TRAINING:
-            name = without_worker(place.name)
-            if log.job:
-                # All workers of a job began with the same checkpoint; the next job in the same folder with another.
-                name = f"{log.job}, {first_checkpoint(log)}"
-            worker = place.worker if log.worker is None else log.worker
-            place = replace(place, root=(*place.root, name), worker=worker)
-        job = place.root
-        self.roots[number] = place.root
-        if not log.steps.rows:
-            return
-        settings = log.hyperparameters or {}
-        per_iteration = settings.get("num_episodes_between_training", self._per_iteration)
-        whole = per_iteration if isinstance(per_iteration, int) and per_iteration > 0 else self._per_iteration
-        table = in_degrees(concatenated([log.steps.whole]))
-        mine = Drives(place, table, iterations_of(table, log, whole), log.world or "", [place.name])
-        if place.kind != TRAINING:
-            mine.iteration[:] = 0
-        left, alike = np.ones(len(mine.iteration), np.bool_), False
-        for other in self.drives:
-            same = rows_also_in(mine, other)
-            if same.any():
-                if left.all() and other.place.kind == place.kind:  # of copies the first counts
-                    alike = True
-                    self.roots[number] = other.place.root
-                    if place.kind == TRAINING:
-                        self.jobs[job] = other.place.root
-                left &= ~same
-                other.world = log.world or other.world
-                other.names.append(place.name)
-        if left.all():
-            mine.world = mine.world or self.parts.worlds.get(place.kind, "")
-            self.drives.append(mine)
-        elif left.any() and not alike:
-            self.drives.append(mine.choose(left))
-        elif left.any():
-            self._add_rest(file, mine.choose(left), self.roots[number], _finished(mine))
-
-    def _add_rest(self, file: LogFile, rest: Drives, root: tuple[str, ...], finished: Ints) -> None:
-        """Add the finished iterations that only the log contains."""
-        others = [one for one in self.drives if one.place.root == root and one.place.kind == rest.place.kind]
-        known = np.unique(np.concatenate([one.iteration for one in others]))
-        whole = ~np.isin(rest.iteration, known) & np.isin(rest.iteration, finished)
-        if rest.place.kind == TRAINING and whole.any():
-            more, into = rest.choose(whole), others[0]
-            iteration = np.concatenate([into.iteration, more.iteration])
-            order = np.argsort(iteration, kind="stable")
-            table = concatenated([into.table, more.table]).take(order)
-            whole_drives = Drives(into.place, table, iteration[order], into.world, into.names)
-            self.drives[self.drives.index(into)] = whole_drives
-            rest = rest.choose(~whole)
-        if rest.table.num_rows:
-            episodes = rest.table["episode"].to_numpy()
-            reason = (
-                f"{rest.table.num_rows} steps of episodes {episodes.min()} to {episodes.max()} are left out: they are "
-                "in the log only, not in the CSVs of the same training"
-            )
-            self.problems.append(LogProblem(str(file.path), None, reason, lines=rest.table.num_rows))
-
-    def _without_copies(self) -> None:
-        """Leave out drives that occur twice, as with a copy of a folder."""
-        known: dict[tuple[str, bytes, bytes], Drives] = {}
-        for one in list(self.drives):
-            times = one.table["tstamp"].to_numpy()
-            first = known.setdefault((one.place.kind, one.key.tobytes(), times.tobytes()), one)
-            if first is not one and len(times):
-                reason = f"{len(times)} steps are left out: copies of {'/'.join(first.place.root)}"
-                self.problems.append(LogProblem("/".join(one.place.root), None, reason, lines=len(times)))
-                self.drives.remove(one)
-                self.copies[one.place.root] = one
-
-    def _without_repeats(self) -> None:
-        for number, one in enumerate(self.drives):
-            twice = repeated(one)
-            if twice.any():
-                count = int(twice.sum())
-                reason = f"{count} rows are left out: they are there twice"
-                self.problems.append(LogProblem("/".join(one.place.root), None, reason, lines=count))
-                self.drives[number] = one.choose(~twice)
 
     def _training_rows(self) -> tuple[list[Rows], Numbers, dict[int, int]]:
         """Return the rows, the numbers of the episodes, and the first iteration of each round."""
@@ -296,7 +166,7 @@ class _Assembly:
         return [
             log
             for at, (files, log) in enumerate(self.logs)
-            if (log.saved or (log.checkpoints and log.steps.rows and _place(files, log).kind == TRAINING))
+            if (log.saved or (log.checkpoints and log.steps.rows and log_place(files, log).kind == TRAINING))
             and self._round(files[0], self.roots[at]) == number
         ]
 
@@ -428,24 +298,6 @@ class _Assembly:
         return typed_table(METRICS_COLUMNS, rows)
 
 
-def _place(files: Sequence[LogFile], log: TrainingLog) -> Place:
-    """Return the job of a log, by its name, or by its settings where the name says nothing of a race."""
-    place = place_of(files[0].parts)
-    return replace(place, kind=log.kind, worker=0) if log.kind and place.kind == TRAINING else place
-
-
-def _finished(log: Drives) -> Ints:
-    """Return the finished iterations of a log.
-
-    All but the last are, and the last is if nearly as many episodes ended in it as in the one before: a job ends in
-    the middle of an episode.
-    """
-    iterations = np.unique(log.iteration)
-    done = log.table["done"].to_numpy()
-    counts = [int(done[log.iteration == one].sum()) for one in iterations[-2:]]
-    return iterations if len(counts) > 1 and counts[1] >= _NEARLY * counts[0] else iterations[:-1]
-
-
 def _iterations_by_trial(rows: Sequence[Mapping[str, Any]]) -> list[int]:
     """Return the iteration of each episode of a metrics file, from 0: its trials are counted from 1."""
     found: list[int] = []
@@ -489,13 +341,3 @@ def _iterations(updates: Sequence[Update]) -> list[int]:
                 max(-1 if update.logged_iteration is None else update.logged_iteration, found[-1] + 1)
             )
     return found
-
-
-def _uppermost(found: Sequence[tuple[LogFile, Any]]) -> Any:
-    """Return the content of the file nearest to the top; settings precede logs, a training's precede others."""
-
-    def rank(one: tuple[LogFile, Any]) -> tuple[bool, bool, int]:
-        parts = one[0].parts
-        return not one[0].name.endswith((".json", ".py")), place_of(parts).kind != TRAINING, len(parts)
-
-    return min(found, key=rank)[1] if found else None

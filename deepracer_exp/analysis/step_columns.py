@@ -1,0 +1,233 @@
+"""The steps of a recording: columns derived from them, and which rows begin an episode, a lap or a reset."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+from numba import njit
+from numpy.typing import NDArray
+
+from deepracer_exp.aws.logs.recording import TRAINING
+from deepracer_exp.env.rules import lap_clock_s
+from deepracer_exp.tracks.track import Track
+
+from .statistics import Values
+
+DERIVED_COLUMNS: Mapping[str, str] = {
+    "lap_clock_s": "s since the lap began, as the service counts a lap time (`rules.lap_clock_s`)",
+    "delta_time_s": "s since the row before; 0 in an episode's first row except on a flying lap; likewise the others",
+    "delta_dist_m": "m from the row before; 0 in an episode's first row",
+    "track_speed_mps": "m/s, distance over time since the row before; NaN in an episode's first row",
+    "progress_speed_pps": "per cent of the lap a second since the row before; NaN in an episode's first row",
+    "acceleration_mps2": "m/s2 of growing track speed, between the rows before and after; 0 where it falls",
+    "braking_mps2": "m/s2 of falling track speed, likewise, positive; 0 where it grows",
+    "yaw_rate_dps": "degrees a second since the row before, positive to the left",
+    "true_bearing_deg": "degrees, -180 to 180, direction in which the logged point moved since the row before",
+    "slide_deg": "degrees, direction in which the rear axle moved since the row before minus the mean of both yaws; "
+    "0 for tyres that do not slip, positive where the tail goes to the left",
+    "skew_deg": "degrees, direction of travel minus that of the centre line, positive to the left",
+    "lap_position": "0 to 1, normalised projection on the centre line in driving direction; without a course "
+    "computed from progress and the waypoint of the start",
+    "offset_m": "m from the centre line, positive to the left of the driving direction",
+    "discounted_future_reward": "reward units, of this row and all later ones of the episode, discounted",
+}
+"""Names of the columns that `add_derived` adds, with meaning and unit."""
+CONTROL_PERIOD_S = 1 / 15
+"""The service's, for recordings without two rows in succession."""
+FRONT_TO_REAR_AXLE_M = 0.14 + 0.081663
+"""From the logged point back to the rear axle (deepracer-simapp: front point, rear wheels of the car's model)."""
+STILL_M = 0.01
+"""Below this a movement has no direction."""
+STOPPED = ("off_track", "crashed", "immobilized", "reversed")
+"""Status of the rows after which a car is put back, or the episode ends."""
+FIRST_STEPS = 2
+"""Highest step number of an episode's first row: formats without prepare rows may begin with 2."""
+
+
+def add_derived(steps: pd.DataFrame, course: Track | None, discount: float) -> pd.DataFrame:
+    """Return the steps with `DERIVED_COLUMNS`.
+
+    Args:
+        steps: rows of each episode contiguous and in the order of time.
+        course: what was driven on.
+        discount: factor on the reward of the next step.
+    """
+    x, y, yaw, time_s, progress, reward = (
+        steps[name].to_numpy(np.float64) for name in ("X", "Y", "yaw", "tstamp", "progress", "reward")
+    )
+    first = first_rows(steps)
+    lap_position, offset_m, center_deg = _places(steps, first, course)
+    stopped = first & ~flying_rows(steps)
+    delta_time_s, dx, dy = (_since(values, stopped) for values in (time_s, x, y))
+    delta_dist_m = np.hypot(dx, dy)
+    moving = ~stopped & (delta_dist_m >= STILL_M)
+    passed_s = np.where(delta_time_s > 0, delta_time_s, np.nan)
+    track_speed_mps = delta_dist_m / passed_s
+    change = _change(track_speed_mps, time_s, stopped)
+    turned = _wrapped(_since(yaw, stopped))
+    bearing = np.where(moving, np.degrees(np.arctan2(dy, dx)), np.nan)
+    heading = np.radians(yaw)
+    rear_dx = _since(x - FRONT_TO_REAR_AXLE_M * np.cos(heading), stopped)
+    rear_dy = _since(y - FRONT_TO_REAR_AXLE_M * np.sin(heading), stopped)
+    slide = _wrapped(np.degrees(np.arctan2(rear_dy, rear_dx)) - (yaw - turned / 2))
+    # Both are directions between two rows, because a centre line turns by up to 10 degrees at a waypoint.
+    center_turned = _wrapped(_since(center_deg, first))
+    return steps.assign(
+        lap_clock_s=_lap_clock(steps, stopped, first, delta_time_s),
+        delta_time_s=delta_time_s,
+        delta_dist_m=delta_dist_m,
+        track_speed_mps=track_speed_mps,
+        progress_speed_pps=_since(progress, first) / np.where(first, np.nan, passed_s),
+        acceleration_mps2=np.maximum(change, 0.0),
+        braking_mps2=np.maximum(-change, 0.0),
+        yaw_rate_dps=turned / passed_s,
+        true_bearing_deg=bearing,
+        slide_deg=np.where(moving & (np.hypot(rear_dx, rear_dy) >= STILL_M), slide, np.nan),
+        skew_deg=_wrapped(bearing - (center_deg - center_turned / 2)),
+        lap_position=lap_position,
+        offset_m=offset_m,
+        discounted_future_reward=_discounted(np.nan_to_num(reward), first, discount),
+    )
+
+
+def _lap_clock(
+    steps: pd.DataFrame, stopped: NDArray[np.bool_], first: NDArray[np.bool_], delta_time_s: Values
+) -> Values:
+    """Return the clock of a lap: the time before its first row was driven without a pause, the rest is recorded."""
+    begin, tstamp = np.flatnonzero(first), steps["tstamp"].to_numpy(np.float64)
+    period_s = float(np.median(delta_time_s[~stopped])) if not stopped.all() else CONTROL_PERIOD_S
+    # The generation that counts from 0 has no prepare rows either.
+    before_s = lap_clock_s(np.maximum(steps["steps"].to_numpy()[begin], 1), period_s)
+    began_s = tstamp[begin] - np.where(stopped[begin], before_s, delta_time_s[begin])
+    return tstamp - began_s[np.cumsum(first) - 1]
+
+
+def timed_by_service(steps: pd.DataFrame, metrics: pd.DataFrame) -> tuple[pd.DataFrame, int]:
+    """Set the clocks of complete laps to the times that the service's metrics files give.
+
+    Args:
+        steps: rows of each episode contiguous, with the derived columns.
+        metrics: `recording.METRICS_COLUMNS`.
+
+    Returns:
+        The steps, and of how many laps without resets the files give the time.
+    """
+    in_training = metrics["stream"].astype(str) == TRAINING
+    laps = metrics[(metrics["completion"] >= 100.0) & (in_training == (metrics["phase"] == "training"))]
+    if laps.empty or steps.empty:
+        return steps, 0
+    begin = np.flatnonzero(first_rows(steps))
+    counts = np.diff(np.append(begin, len(steps)))
+    end = begin + counts - 1
+    official = laps.drop_duplicates(["stream", "episode"]).astype({"stream": str})
+    keys = steps.iloc[end][["stream", "episode"]].astype({"stream": str})
+    known_s = keys.merge(official, how="left", on=["stream", "episode"])["time_s"].to_numpy(np.float64)
+    whole = (np.maximum.reduceat(steps["progress"].to_numpy(np.float64), begin) >= 100.0) & whole_from_start(
+        steps
+    )
+    late_s = np.where(whole, known_s - steps["lap_clock_s"].to_numpy()[end], np.nan)
+    moved = steps["lap_clock_s"].to_numpy() + np.repeat(np.nan_to_num(late_s), counts)
+    return steps.assign(lap_clock_s=moved), int((np.isfinite(late_s) & (resets(steps) == 0)).sum())
+
+
+def _places(
+    steps: pd.DataFrame, first: NDArray[np.bool_], course: Track | None
+) -> tuple[Values, Values, Values]:
+    """Return lap position, offset and the centre line's direction in degrees."""
+    if course is not None:
+        found = course.project(steps[["X", "Y"]].to_numpy(np.float64))
+        return found.ndist, found.offset_m, np.degrees(found.heading_rad)
+    unknown = np.full(len(steps), np.nan)
+    if not len(steps):
+        return unknown, unknown, unknown
+    waypoint, progress = (steps[name].to_numpy(np.float64) for name in ("closest_waypoint", "progress"))
+    start = waypoint / (waypoint.max() + 1.0) - progress / 100.0
+    return (start[first][np.cumsum(first) - 1] + progress / 100.0) % 1.0, unknown, unknown
+
+
+def _since(values: Values, first: NDArray[np.bool_]) -> Values:
+    """Return the differences to the rows before, 0 in first rows."""
+    since = np.diff(values, prepend=values[:1])
+    since[first] = 0.0
+    return since
+
+
+def _change(speed_mps: Values, time_s: Values, first: NDArray[np.bool_]) -> Values:
+    """Return the speed's change a second between the rows before and after; 0 where one of them is missing.
+
+    A speed is that of the time since the row before: its moment is the middle of it. Control steps last 50 to 80 ms
+    in the service's traces, so that differences of neighbours would be mostly noise.
+    """
+    change = np.zeros(len(speed_mps))
+    if len(change) > 3:
+        passed_s = (time_s[3:] + time_s[2:-1] - time_s[1:-2] - time_s[:-3]) / 2.0
+        with np.errstate(divide="ignore", invalid="ignore"):
+            change[2:-1] = (speed_mps[3:] - speed_mps[1:-2]) / passed_s
+        change[2:-1][first[3:] | first[2:-1] | first[1:-2]] = 0.0
+    return np.nan_to_num(change, nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def _wrapped(angle_deg: Values) -> Values:
+    return (angle_deg + 180.0) % 360.0 - 180.0
+
+
+@njit(cache=True, nogil=True)
+def _discounted(reward, first, discount):  # type: ignore[no-untyped-def]
+    future = np.empty(len(reward))
+    total = 0.0
+    for i in range(len(reward) - 1, -1, -1):
+        total = reward[i] + discount * total
+        future[i] = total
+        if first[i]:
+            total = 0.0
+    return future
+
+
+def first_rows(steps: pd.DataFrame) -> NDArray[np.bool_]:
+    """Return which rows are the first of their episode; the rows of an episode must be contiguous."""
+    stream = steps["stream"].astype("category").cat.codes.to_numpy()
+    episode = steps["episode"].to_numpy()
+    first = np.ones(len(steps), bool)
+    first[1:] = (episode[1:] != episode[:-1]) | (stream[1:] != stream[:-1])
+    return first
+
+
+def flying_rows(steps: pd.DataFrame) -> NDArray[np.bool_]:
+    """Return which first rows continue the row before: laps of a race are driven without a stop."""
+    number = steps["steps"].to_numpy()
+    stream = steps["stream"].astype("category").cat.codes.to_numpy()
+    flying = first_rows(steps) & (number > FIRST_STEPS)
+    flying[:1] = False
+    flying[1:] &= (number[1:] == number[:-1] + 1) & (stream[1:] == stream[:-1])
+    return flying
+
+
+def whole_from_start(steps: pd.DataFrame) -> NDArray[np.bool_]:
+    """Return for each episode whether its beginning is recorded."""
+    begin = np.flatnonzero(first_rows(steps))
+    return (steps["steps"].to_numpy()[begin] <= FIRST_STEPS) | flying_rows(steps)[begin]
+
+
+def resets(steps: pd.DataFrame) -> NDArray[np.int64]:
+    """Return for each episode how often the car was put back on its way."""
+    first = first_rows(steps)
+    stopped = steps["episode_status"].isin(STOPPED).to_numpy()
+    begins = stopped.copy()
+    begins[1:] &= first[1:] | ~stopped[:-1]
+    begin = np.flatnonzero(first)
+    end = np.append(begin[1:], len(steps))[: len(begin)] - 1
+    return (
+        np.add.reduceat(begins, begin, dtype=np.int64) - stopped[end] if len(begin) else np.zeros(0, np.int64)
+    )
+
+
+def laps_driven(steps: pd.DataFrame) -> NDArray[np.bool_]:
+    """Return for each episode whether it is a complete lap without a reset whose beginning is recorded.
+
+    Only these show the driving line and what a lap takes: a car that is put back stands, and drives a part of the lap
+    again.
+    """
+    begin = np.flatnonzero(first_rows(steps))
+    progress = steps["progress"].to_numpy(np.float64)
+    complete = np.maximum.reduceat(progress, begin) >= 100.0 if len(begin) else np.zeros(0, bool)
+    return complete & whole_from_start(steps) & (resets(steps) == 0)
