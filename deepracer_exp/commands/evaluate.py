@@ -346,9 +346,16 @@ def _replay(args: argparse.Namespace) -> int:
     from deepracer_exp.stopping.replay import replay, table
 
     rules = [
-        (" ".join(line.removeprefix("stopping").lstrip(".=") for line in lines), compose_experiment(lines)[0])
+        (" ".join(map(_within_group, lines)), compose_experiment(lines)[0])
         for lines in expand_grid(overrides)
     ]
     replays = [replay(record, config.stopping, rule) for record in records for rule, config in rules]
     table_console().print(table(replays))
     return 0
+
+
+def _within_group(line: str) -> str:
+    """Return an override without its group: ``plateau``, ``converged.patience=40``."""
+    key, _, value = line.partition("=")
+    _, _, inside = key.partition(".")
+    return f"{inside}={value}" if inside else value

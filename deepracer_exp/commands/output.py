@@ -91,7 +91,7 @@ def print_result(outcome: "TrainResult", tracking: "TrackingConfig") -> None:
         print(f"  details: {outcome.folder}", file=sys.stderr)
         _print_unrecorded([outcome], tracking)
         return
-    print(f"\n{outcome.status}: {outcome.reason}")
+    print(f"\n{outcome.ending}")
     print(
         f"  {count(summary['iteration'], 'iteration')}, {count(summary['env_steps'], 'step')} in "
         f"{summary['wall_clock_s']:.0f} s; exploring: {count(summary['episodes'], 'episode')}, {_laps(summary)}"

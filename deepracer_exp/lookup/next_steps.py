@@ -23,6 +23,7 @@ from deepracer_exp.runs.result import (
     FAILED,
     FIGURES,
     INTERRUPTED,
+    Ending,
     fastest_reliable,
     read_result,
 )
@@ -93,8 +94,8 @@ def official_place(run: RunRecord) -> str | None:
 
 def state(run: RunRecord) -> str:
     """Return whether a run is running, was killed, or how it ended."""
-    if run.summary:
-        return f"{run.summary['status']}: {run.summary['reason']}"
+    if (ending := Ending.stored(run.summary)) is not None:
+        return str(ending)
     return "running" if is_held(run.path) else "killed"
 
 

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from deepracer_exp.errors import BadInput
 
@@ -39,6 +39,40 @@ higher value is better (1) or a lower one (-1)."""
 def with_unit(number: str, unit: str) -> str:
     """Return a number and its unit as English writes them: ``8.02 s``, ``97.3%``."""
     return f"{number}%" if unit == "%" else f"{number} {unit}"
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a run ended; its fields are keys of summary.json."""
+
+    status: str
+    """FINISHED, STOPPED_EARLY (more training would not have helped), INTERRUPTED or FAILED."""
+    reason: str
+    """A sentence on what ended it."""
+    rule: str | None = None
+    """Name of the stopping rule or the pruner that ended it; None: something else did."""
+    limit: str | None = None
+    """Key of the budget that was used up; None: something else ended it."""
+
+    @classmethod
+    def by_rule(cls, rule: str, why: str, status: str) -> Self:
+        """Return the ending by a stopping rule or a pruner, for a reason in words."""
+        return cls(status, f"{rule.replace('_', ' ')}: {why}", rule=rule)
+
+    @classmethod
+    def by_budget(cls, limit: str) -> Self:
+        """Return the ending of a run that has used up its budget."""
+        return cls(FINISHED, f"budget reached: {limit}", limit=limit)
+
+    @classmethod
+    def stored(cls, summary: Mapping[str, Any]) -> Self | None:
+        """Return the ending in a run's summary, None where the run has not ended."""
+        status, reason = summary.get("status"), str(summary.get("reason"))
+        return None if status is None else cls(status, reason, summary.get("rule"), summary.get("limit"))
+
+    def __str__(self) -> str:
+        """Return it in words: ``finished: budget reached: env_steps``."""
+        return f"{self.status}: {self.reason}"
 
 
 @dataclass(frozen=True, kw_only=True)

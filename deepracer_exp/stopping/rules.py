@@ -15,7 +15,7 @@ from deepracer_exp.config.stopping import (
     StoppingConfig,
 )
 from deepracer_exp.errors import count
-from deepracer_exp.runs.result import reliable_lap_s
+from deepracer_exp.runs.result import FINISHED, STOPPED_EARLY, Ending, reliable_lap_s
 
 from . import trends
 from .trends import Average, Reason
@@ -50,7 +50,12 @@ class Decision:
 
     def __str__(self) -> str:
         """Return rule and reason, e.g. ``reliable: 94% of the last 50 episodes completed the lap``."""
-        return f"{self.rule.replace('_', ' ')}: {self.why}"
+        return self.ending.reason
+
+    @property
+    def ending(self) -> Ending:
+        """How a run ends by it."""
+        return Ending.by_rule(self.rule, self.why, STOPPED_EARLY if self.stopped_early else FINISHED)
 
     def as_dict(self) -> dict[str, Any]:
         """Return it for summary.json."""

@@ -21,7 +21,7 @@ from deepracer_exp.errors import BadInput, count
 from deepracer_exp.lifeline import given_environment, running
 from deepracer_exp.lookup.next_steps import command_line, run_word
 from deepracer_exp.runs.files import METRICS, SUMMARY, read_config, read_object
-from deepracer_exp.runs.result import FAILED, INTERRUPTED
+from deepracer_exp.runs.result import FAILED, INTERRUPTED, Ending
 
 _log = logging.getLogger(__name__)
 
@@ -37,6 +37,7 @@ _WORDS: dict[str, Callable[[float], str]] = {
 }
 _EXPERIMENT = "experiment_"
 """Beginning of the keys of limits that all runs of an experiment share."""
+_WORDS_BY_KEY = _WORDS | {f"{_EXPERIMENT}{name}": words for name, words in _WORDS.items()}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +77,7 @@ class Budget:
             spent = own + others
             percent = max((share for share in self._config.alerts if 100 * spent >= share * most), default=0)
             if not first and percent > self._alerted[limit]:
-                words = _WORDS[limit.removeprefix(_EXPERIMENT)]
+                words = _WORDS_BY_KEY[limit]
                 message = f"{percent}% of budget.{limit} used: {words(spent)} of {words(most)}"
                 passed.append(Alert(limit=limit, percent=percent, message=message))
             self._alerted[limit] = max(percent, self._alerted.get(limit, 0))
@@ -149,21 +150,21 @@ def refuse_ended(run_dir: Path, config: BudgetConfig, overrides: Sequence[str]) 
         RunEnded: it says how the run can be resumed anyway.
     """
     summary = read_object(run_dir / SUMMARY)
-    status, reason = summary.get("status"), str(summary.get("reason"))
-    if status in (None, INTERRUPTED, FAILED):
+    ending = Ending.stored(summary)
+    if ending is None or ending.status in (INTERRUPTED, FAILED):
         return
-    if summary.get("limit") is None:
+    if ending.limit is None:
         if "stopping" in map(group_of, overrides):
             return
         clone = command_line("clone", run_word(run_dir), read_config(run_dir))
         raise RunEnded(
-            f"{run_dir}: has ended ({status}: {reason}); stopping=none resumes it anyway, `{clone}` starts a new run "
+            f"{run_dir}: has ended ({ending}); stopping=none resumes it anyway, `{clone}` starts a new run "
             "from its best checkpoint"
         )
     used = Budget(config, run_dir).used(summary["env_steps"], summary["iteration"], summary["wall_clock_s"])
     if used[1] >= 1:
         raise RunEnded(
-            run_dir, f"has ended ({reason}); to resume it, give it more, such as budget.{used[0]}="
+            run_dir, f"has ended ({ending.reason}); to resume it, give it more, such as budget.{used[0]}="
         )
 
 

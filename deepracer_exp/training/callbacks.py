@@ -12,7 +12,7 @@ from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.reports.run_page import write_pictures, write_run_page
-from deepracer_exp.runs.result import FINISHED, STOPPED_EARLY
+from deepracer_exp.runs.result import FINISHED, STOPPED_EARLY, Ending
 from deepracer_exp.stopping.rules import Decision, StoppingRule, build_rule
 from deepracer_exp.tracking.delivery import ENDS
 from deepracer_exp.tracking.metadata import END_TAG, joined
@@ -149,8 +149,7 @@ class StoppingCallback(Callback):
             raise RunFailed(f"{self._rule.__class__.__name__}.observe returned {found!r}: {error}") from error
         self._decision = found
         if self._decision is not None:
-            status = STOPPED_EARLY if self._decision.stopped_early else FINISHED
-            trainer.request_stop(str(self._decision), status)
+            trainer.request_stop(self._decision.ending)
 
 
 class BudgetCallback(Callback):
@@ -187,7 +186,7 @@ class BudgetCallback(Callback):
     def _check(self, trainer: Trainer) -> None:
         limit, fraction = trainer.budget.used(*trainer.usage)
         if fraction >= 1:
-            trainer.request_stop(f"budget reached: {limit}", limit=limit)
+            trainer.request_stop(Ending.by_budget(limit))
 
 
 class RecordCallback(Callback):
@@ -246,7 +245,7 @@ class TrackingCallback(Callback):
         self._tracker.safe_until(trainer.saved_steps)
         for file, folder in files_to_keep(trainer.folder.path):
             self._tracker.log_artifact(file, folder)
-        self._tracker.set_tag(END_TAG, f"{result.status}: {result.reason}")
+        self._tracker.set_tag(END_TAG, str(result.ending))
         if self._tracker.outage is not None:
             line = f"{self._tracker.outage}; waiting for at most {FINISH_S:g} s"
             self._console.print(line, markup=False, highlight=False, soft_wrap=True)
@@ -272,7 +271,7 @@ class DisplayCallback(Callback):
 
     def on_fit_start(self, trainer: Trainer) -> None:
         """Show the view before the cars: workers take a second or two to start."""
-        if trainer.stop_reason is None:
+        if trainer.ending is None:
             names, metrics = self._names, trainer.metrics
             header = RunHeader(
                 name=trainer.folder.name,

@@ -9,7 +9,7 @@ import shutil
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -46,7 +46,7 @@ from deepracer_exp.runs.files import (
 from deepracer_exp.runs.fingerprint import refuse_changes
 from deepracer_exp.runs.folder import RunFolder
 from deepracer_exp.runs.lineage import Lineage, read_lineage
-from deepracer_exp.runs.result import FINISHED, INTERRUPTED
+from deepracer_exp.runs.result import FINISHED, INTERRUPTED, Ending
 from deepracer_exp.sim.batch import CarBatch
 from deepracer_exp.stopping.rules import UNDECIDED
 from deepracer_exp.tracking.build import open_tracker
@@ -120,7 +120,7 @@ def store_run(
     """
     setup = build_setup(experiment)
     trainer = _begin(experiment, composition, setup, Console(quiet=True), (networks, None))
-    return trainer.end(FINISHED, reason, 0)
+    return trainer.end(Ending(FINISHED, reason), 0)
 
 
 def resume_training(
@@ -401,9 +401,8 @@ def _run(trainer: Trainer, interruption: Interruption) -> TrainResult:
 
 def _ended(trainer: Trainer, interruption: Interruption) -> TrainResult:
     try:
-        reason = trainer.fit(interruption)
-        code = interruption.exit_code
-        return trainer.end(trainer.status if code is None else INTERRUPTED, reason, code or 0)
+        ending, code = trainer.fit(interruption), interruption.exit_code
+        return trainer.end(ending if code is None else replace(ending, status=INTERRUPTED), code or 0)
     except (RunFailed, BadInput) as error:  # BadInput: a file of the run was removed or changed meanwhile
         return trainer.fail(str(error), error)
     except OSError as error:
@@ -412,7 +411,8 @@ def _ended(trainer: Trainer, interruption: Interruption) -> TrainResult:
         raise
     except KeyboardInterrupt:
         # No checkpoint, since an update may be half done, and no pictures.
-        return trainer.end(INTERRUPTED, "ended at once by a second signal", interruption.exit_code or 130)
+        ending = Ending(INTERRUPTED, "ended at once by a second signal")
+        return trainer.end(ending, interruption.exit_code or 130)
     except Exception as error:
         if is_refused_memory(error):
             cars, frames = (

@@ -6,7 +6,7 @@ import logging
 import signal
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ from deepracer_exp.runs.crash_dump import write_crash_dump
 from deepracer_exp.runs.files import SUMMARY, TRACE
 from deepracer_exp.runs.fingerprint import fingerprint
 from deepracer_exp.runs.folder import RunFolder
-from deepracer_exp.runs.result import FAILED, FINISHED
+from deepracer_exp.runs.result import FAILED, FINISHED, INTERRUPTED, Ending
 from deepracer_exp.runs.trace import TraceWriter
 from deepracer_exp.sim.batch import cores
 
@@ -54,9 +54,7 @@ class TakenOver(Exception):  # noqa: N818 - reads as what it is at the raise sit
 class TrainResult:
     """How a training ended."""
 
-    status: str
-    """`finished`, `stopped early` (more training would not have helped), `interrupted` or `failed`."""
-    reason: str
+    ending: Ending
     exit_code: int
     folder: Path
     summary: dict[str, Any]
@@ -67,6 +65,16 @@ class TrainResult:
     """A line on what is missing from the results."""
     unrecorded: str | None = None
     """A sentence on what its tracker could not record, and why."""
+
+    @property
+    def status(self) -> str:
+        """`finished`, `stopped early` (more training would not have helped), `interrupted` or `failed`."""
+        return self.ending.status
+
+    @property
+    def reason(self) -> str:
+        """A sentence on what ended it."""
+        return self.ending.reason
 
 
 class Callback:
@@ -133,9 +141,7 @@ class Trainer:
         best: which policy is the best so far.
         saved_steps: env steps of the last checkpoint from which the run can be resumed, 0 before there is one.
         running: the contexts of the loop, its cars among them.
-        stop_reason: why the loop ends, None while it continues.
-        limit: the key of the budget that ended it, None if something else did.
-        status: what the run is once it ends without interruption or failure.
+        ending: how the run ends, None while it continues.
     """
 
     def __init__(
@@ -192,9 +198,7 @@ class Trainer:
         self.best = BestPolicy(experiment, setup)
         self.saved_steps = 0
         self.running = contextlib.ExitStack()
-        self.stop_reason: str | None = None
-        self.limit: str | None = None
-        self.status = FINISHED
+        self.ending: Ending | None = None
         self._interruption = Interruption()
         self._save_requested = False
         self._fingerprint = fingerprint(config, setup)
@@ -205,7 +209,7 @@ class Trainer:
         self._process_began = psutil.Process().create_time()
         folder.open_log()
 
-    def fit(self, interruption: Interruption) -> str:
+    def fit(self, interruption: Interruption) -> Ending:
         """Train until there is a reason to stop, and return it.
 
         `interruption` must have been entered; a signal to it ends the loop after the iteration in progress.
@@ -217,7 +221,7 @@ class Trainer:
         self._interruption = interruption
         with self.running:
             collector = self._start()
-            while collector is not None and self.stop_reason is None:
+            while collector is not None and self.ending is None:
                 # 1. Collect: count steps and episodes; the networks are still those that drove.
                 batch, collect_s = collector.collect(self.experiment.algorithm)
                 rows, finished = self.metrics.enter(batch["next", "trace"].numpy())
@@ -243,24 +247,23 @@ class Trainer:
                 self._check_interruption()
 
                 # 5. Save when due and at the end.
-                if self.stop_reason or self._save_requested or self._is_time_to_save():
+                if self.ending or self._save_requested or self._is_time_to_save():
                     self.save(collector, is_best)
-        assert self.stop_reason is not None
+        assert self.ending is not None
         if interruption.signum is None or not any(one.hurries_when_interrupted for one in self.callbacks):
             self.evaluation = None
             self._call("on_train_end")
             if self.best.evaluated_best(self.evaluation, self.counters()):
                 self.checkpoints.mark_best(self.iteration)
-        return self.stop_reason
+        return self.ending
 
-    def request_stop(self, reason: str, status: str = FINISHED, limit: str | None = None) -> None:
+    def request_stop(self, reason: str | Ending, status: str = FINISHED) -> None:
         """End the run after this iteration; the first request counts.
 
-        `reason` is for the last line of the run and summary.json, `status` FINISHED or STOPPED_EARLY, `limit` the
-        key of the budget that is used up.
+        `reason` is for the last line of the run and summary.json, `status` FINISHED or STOPPED_EARLY.
         """
-        if self.stop_reason is None:
-            self.stop_reason, self.status, self.limit = reason, status, limit
+        if self.ending is None:
+            self.ending = reason if isinstance(reason, Ending) else Ending(status, reason)
 
     def request_save(self) -> None:
         """Write a checkpoint after this iteration."""
@@ -317,24 +320,20 @@ class Trainer:
         """Pass the rows of metrics.jsonl up to the checkpoint to the callbacks again; return them as they left them."""
         replayed = []
         for row in rows:
-            self.stop_reason, self.status, self.limit = None, FINISHED, None  # the last row decides
+            self.ending = None  # the last row decides
             self.row = dict(row)
             self._call("on_replay")
             replayed.append(self.row)
         return replayed
 
-    def end(
-        self, status: str, reason: str, exit_code: int, error: BaseException | None = None
-    ) -> TrainResult:
+    def end(self, ending: Ending, exit_code: int, error: BaseException | None = None) -> TrainResult:
         """Write summary.json and release the run.
 
         Raises:
             OSError: the file cannot be written; not if the run failed.
         """
         summary = {
-            "status": status,
-            "reason": reason,
-            "limit": self.limit,
+            **asdict(ending),
             **self.counters(),
             "seed": self.experiment.seed,
             "wall_clock_s": round(self.wall_clock_s, 3),
@@ -345,13 +344,13 @@ class Trainer:
         for callback in self.callbacks:
             summary |= callback.summary(self)
         summary["best"] = self.best.record
-        logger.log(logging.ERROR if error else logging.INFO, "%s: %s", status, reason, exc_info=error)
+        logger.log(logging.ERROR if error else logging.INFO, "%s", ending, exc_info=error)
         try:
             self.folder.write(SUMMARY, json.dumps(summary, indent=2) + "\n")
         except OSError:
-            if status != FAILED:
+            if ending.status != FAILED:
                 raise
-        result = TrainResult(status, reason, exit_code, self.folder.path, summary, error)
+        result = TrainResult(ending, exit_code, self.folder.path, summary, error)
         self._call("on_run_end", result)
         self.folder.release()
         return result
@@ -359,7 +358,7 @@ class Trainer:
     def fail(self, reason: str, error: BaseException, exit_code: int = RunFailed.exit_code) -> TrainResult:
         """Write a crash dump and end the run as failed."""
         write_crash_dump(self.folder.path, error)
-        return self.end(FAILED, reason, exit_code, error)
+        return self.end(Ending(FAILED, reason), exit_code, error)
 
     def release(self) -> None:
         """Leave the run to the process that continues it: nothing more is written into its folder."""
@@ -403,7 +402,7 @@ class Trainer:
         # There is one already if the run was killed while it was ending, or Ctrl-C came while it began.
         self._check_interruption()
         self._call("on_fit_start")
-        if self.stop_reason is not None:
+        if self.ending is not None:
             return None
         experiment = self.experiment
         return self.running.enter_context(
@@ -419,7 +418,8 @@ class Trainer:
 
     def _check_interruption(self) -> None:
         if self.is_interrupted:
-            self.stop_reason = "by Ctrl-C" if self._interruption.signum == signal.SIGINT else "by SIGTERM"
+            how = "by Ctrl-C" if self._interruption.signum == signal.SIGINT else "by SIGTERM"
+            self.ending = Ending(INTERRUPTED, how)
 
     def _call(self, hook: str, *arguments: Any) -> None:
         for callback in self.callbacks:

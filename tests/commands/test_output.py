@@ -7,6 +7,7 @@ import pytest
 
 from deepracer_exp.commands.output import print_result, print_steps, print_unsent
 from deepracer_exp.config.running import MLflowTracking
+from deepracer_exp.runs.result import Ending
 from deepracer_exp.training.trainer import TrainResult
 
 
@@ -33,7 +34,7 @@ def test_a_command_is_never_broken_by_what_it_does(capsys, monkeypatch, columns,
 def test_a_finished_training_names_the_store_that_recorded_it(trained, capsys, uri, shown):
     folder = trained().folder
     summary = json.loads((folder / "summary.json").read_text())
-    result = TrainResult(summary["status"], summary["reason"], 0, folder, summary)
+    result = TrainResult(Ending.stored(summary), 0, folder, summary)
     print_result(result, MLflowTracking(kind="mlflow", uri=uri))
     (line,) = (line for line in capsys.readouterr().out.splitlines() if "compare runs" in line)
     assert f" ui {shown}" in line
@@ -77,7 +78,7 @@ def test_the_last_lines_of_a_training_name_the_fastest_reliable_lap(tmp_path, ca
         "best": best,
     }
     (tmp_path / "config.yaml").write_text("name: season\n")
-    print_result(TrainResult("stopped early", "it does not learn", 0, tmp_path, summary), None)
+    print_result(TrainResult(Ending("stopped early", "it does not learn"), 0, tmp_path, summary), None)
     shown = capsys.readouterr().out.splitlines()
     assert f"  fastest reliable lap: {words}" in shown
     assert any("exploring: 12 episodes, 3 laps, the fastest in 6.10 s" in line for line in shown)

@@ -1,8 +1,29 @@
 """What is said of a run's policies names whose laps are meant, under which conditions."""
 
+from dataclasses import asdict
+
 import pytest
 
-from deepracer_exp.runs.result import fastest_reliable, result_of
+from deepracer_exp.runs.result import Ending, fastest_reliable, result_of
+
+
+@pytest.mark.parametrize(
+    ("ending", "words"),
+    [
+        (Ending.by_rule("not_learning", "no lap", "stopped early"), "stopped early: not learning: no lap"),
+        (Ending.by_budget("experiment_minutes"), "finished: budget reached: experiment_minutes"),
+        (Ending("interrupted", "by Ctrl-C"), "interrupted: by Ctrl-C"),
+    ],
+)
+def test_an_ending_is_read_back_from_a_summary_as_it_was(ending, words):
+    assert Ending.stored({**asdict(ending), "iteration": 4}) == ending
+    assert str(ending) == words
+
+
+def test_an_ending_is_read_from_a_summary_that_names_neither_rule_nor_limit():
+    summary = {"status": "finished", "reason": "reliable: 94% of the last 50 episodes completed the lap"}
+    assert Ending.stored(summary) == Ending(**summary)
+    assert Ending.stored({}) is None
 
 
 def row(iteration: int, lap_s: float | None, laps: int, tried: int = 8) -> dict:

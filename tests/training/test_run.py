@@ -11,6 +11,7 @@ from deepracer_exp.agents.ppo import PPO
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.observation import Features
 from deepracer_exp.runs.files import read_metrics
+from deepracer_exp.runs.result import Ending
 from deepracer_exp.runs.trace import read_trace
 from deepracer_exp.training.run import run_training
 
@@ -108,6 +109,7 @@ def test_the_same_seed_gives_the_same_run_in_one_process_and_in_several(call, tm
 def test_each_limit_of_the_budget_ends_the_run_with_its_name(trained, limits, reason, iterations):
     ended = trained(*limits)
     assert ended.code == 0
+    assert Ending.stored(ended.summary) == Ending.by_budget(reason)
     assert (ended.summary["reason"], ended.summary["stopping"]) == (f"budget reached: {reason}", None)
     if iterations is not None:
         assert (ended.summary["iteration"], ended.summary["env_steps"]) == (iterations, 1024 * iterations)

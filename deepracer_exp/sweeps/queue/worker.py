@@ -34,7 +34,7 @@ from deepracer_exp.runs.files import (
 )
 from deepracer_exp.runs.folder import is_held
 from deepracer_exp.runs.lineage import Lineage
-from deepracer_exp.runs.result import FAILED, FINISHED, INTERRUPTED, STOPPED_EARLY
+from deepracer_exp.runs.result import FAILED, FINISHED, INTERRUPTED, STOPPED_EARLY, Ending
 from deepracer_exp.sweeps.search.objectives import intermediate_value, objective_values
 from deepracer_exp.sweeps.search.pruners import FirstOf, PruneDecision, build_pruner, is_worse_across_seeds
 from deepracer_exp.sweeps.search.samplers import build_sampler
@@ -174,7 +174,6 @@ class TrialRun(Callback):
         self._runs = list(lease.claim.trial.runs)
         self._seed = 0
         """Index of the present run."""
-        self._pruned_by: str | None = None
         self._parent_run_id: str | None = None
         """MLflow's id of the run above those of the trial."""
 
@@ -210,8 +209,7 @@ class TrialRun(Callback):
             return
         decision = self._patiently(lambda: self._asked(value))
         if decision is not None:
-            self._pruned_by, reason = decision
-            trainer.request_stop(f"{self._pruned_by}: {reason}", STOPPED_EARLY)
+            trainer.request_stop(Ending.by_rule(*decision, STOPPED_EARLY))
 
     def summary(self, trainer: Trainer) -> dict[str, Any]:
         """Name the trial, and check its claim before the end of the run is written: pictures take a second to draw."""
@@ -289,18 +287,16 @@ class TrialRun(Callback):
     def _made(self, overrides: Sequence[str]) -> SeedRun:
         """Make the run of the present seed, and evaluate it."""
         began = time.monotonic()
-        self._pruned_by = None
         if self._run is not None and (lost := self._lost_again(self._run)) is not None:
             return lost
         outcome = (self._run and self._resumed(self._run)) or self._trained(overrides)
         if outcome.status == INTERRUPTED:
             raise Interrupted
-        decision = outcome.summary.get("stopping") or {}
         run = replace(
             self._runs[self._seed],
             status=outcome.status,
             reason=outcome.reason,
-            ending=self._pruned_by or decision.get("rule", FINISHED),
+            ending=outcome.ending.rule or FINISHED,
             env_steps=outcome.summary["env_steps"],
             wall_clock_s=outcome.summary["wall_clock_s"],
         )
@@ -349,7 +345,9 @@ class TrialRun(Callback):
             return resume_training(run_dir, [], None, [self], run_name=title, tags=tags)
         except RunEnded:
             summary = read_object(run_dir / SUMMARY)
-            return TrainResult(summary["status"], summary["reason"], 0, run_dir, summary)
+            ending = Ending.stored(summary)
+            assert ending is not None
+            return TrainResult(ending, 0, run_dir, summary)
 
     def _lost_again(self, run: SeedRun) -> SeedRun | None:
         """Count another attempt at a run; return it as failed if its process was lost each time so far."""
