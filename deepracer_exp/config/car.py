@@ -32,7 +32,6 @@ class CarConfig:
     camera_z_m: Finite
     camera_pitch_deg: Finite
     tilt_deg_per_mps2: Annotated[float, Field(ge=0, le=2, allow_inf_nan=False)] = 0.0
-    """Only the camera leans; tyres depend on load, not on angles."""
 
     mass_kg: Positive
     com_x_m: Finite

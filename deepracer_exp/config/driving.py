@@ -18,7 +18,6 @@ class DiscreteAction:
     """One action of a discrete action space, with the keys of model_metadata.json."""
 
     steering_angle: SteeringDeg
-    """Degrees, positive to the left."""
     speed: SpeedMps
 
 
@@ -45,7 +44,6 @@ class DiscreteActionSpace:
     kind: Literal["discrete"]
     actions: Annotated[tuple[DiscreteAction, ...], Field(max_length=1000)]
     file: str | None
-    """A model_metadata.json that replaces this whole group."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,11 +81,8 @@ class CameraConfig:
     height: Pixels
     color: Literal["grey", "rgb"]
     frames: Annotated[int, Field(ge=1, le=8)]
-    """The last so many pictures, oldest first."""
     stereo_m: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)]
-    """Distance between two cameras side by side, left first; 0: one camera."""
     field_of_view_deg: Annotated[float, Field(ge=10, le=150, allow_inf_nan=False)]
-    """Horizontal."""
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -101,17 +96,11 @@ class LidarConfig:
     """The LIDAR readings that the policy sees; where the scanner sits is the service's."""
 
     kind: Literal["plain", "sectors", "discretized"]
-    """The service's LIDAR (distances), SECTOR_LIDAR (is something near?), DISCRETIZED_SECTOR_LIDAR (how near?)."""
     reach_m: Annotated[float, Field(ge=0.15, le=12, allow_inf_nan=False)] | None
-    """Distance beyond which nothing is seen; None: the service's of this kind."""
     sectors: Literal[1, 2, 4, 8, 16, 32, 64]
-    """With `discretized`: parts into which the rays are divided."""
     values_per_sector: Annotated[int, Field(ge=1, le=64)]
-    """With `discretized`: steps of distance that are distinguished."""
     noise_m: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
-    """Standard deviation of the Gaussian noise on each distance."""
     yaw_deg: Annotated[float, Field(ge=-180, le=180, allow_inf_nan=False)]
-    """Direction of the middle ray, 0: ahead."""
 
     @property
     def furthest_m(self) -> float:
@@ -135,14 +124,11 @@ class ObservationConfig:
     """What is observed: the features, each divided by its scale, the pictures of a camera, and a LIDAR."""
 
     lookahead_m: Annotated[tuple[Positive, ...], Field(max_length=1000)]
-    """Distances ahead along the centre line at which the road is observed."""
     lookahead_scale_m: Divisor
     speed_scale_mps: Divisor
     yaw_rate_scale_radps: Divisor
     parts: tuple[OwnClass, ...] = ()
-    """Classes of your own that add features."""
     camera: CameraConfig | None = None
-    """Pictures for the policy; with them or a LIDAR it does not see the features."""
     lidar: LidarConfig | None = None
 
 
@@ -171,19 +157,12 @@ class EpisodeConfig:
     """Where an episode starts and what ends it (rules of the service's simulator)."""
 
     start_offset: Annotated[float, Field(ge=0, lt=1)]
-    """Start of the first episode as a fraction of the lap."""
     start_advance: Fraction
-    """Fraction of the lap by which the start advances after each episode."""
     max_steps: Natural
-    """Control steps after which an episode is cut off (0: never)."""
     immobilized_steps: Natural
-    """Steps in a row without movement that end an episode (0: never)."""
     immobilized_m: NonNegative
-    """Movement per step, in metres, up to which a car counts as standing."""
     reversed_steps: Natural
-    """Steps in a row of falling progress that end an episode (0: never)."""
     lap_terminates: bool = True
-    """Whether a complete lap of a closed track ends an episode as leaving the road does: no reward can follow."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,11 +171,8 @@ class RewardConfig:
 
     name: str
     file: str | None
-    """A Python file with `reward_function(params)`; replaces `name`."""
     constants: dict[str, Finite]
-    """Values for UPPERCASE constants of the module."""
     time_limit_s: Seconds
-    """Seconds of CPU that one control step's reward calls may take before the run is failed."""
 
 
 Number = TypeVar("Number", int, float)
@@ -230,31 +206,18 @@ class PictureRandomizationConfig:
     """What pictures differ in: the lowest and highest value of each quantity, drawn for each episode of each car."""
 
     brightness_scale: Range[Scale] = (1.0, 1.0)
-    """Factor on all values."""
     contrast_scale: Range[Scale] = (1.0, 1.0)
-    """Factor on the distance of all values from the middle grey."""
     gamma_scale: Range[Scale] = (1.0, 1.0)
-    """Exponent of all values, where white is 1: above 1 dark colours become darker."""
     color_noise: Range[Fraction] = (0.0, 0.0)
-    """Standard deviation of the factor on red, green and blue of each material."""
     light: Range[Fraction] = (0.0, 0.0)
-    """How much darker a shadow in the picture is at its middle, or a spot of light brighter."""
     blur: Range[Fraction] = (0.0, 0.0)
-    """Share of a pixel that comes from its four neighbours."""
     pixel_noise: Range[Fraction] = (0.0, 0.0)
-    """Standard deviation of the Gaussian noise on each pixel at each step, as a fraction of white."""
     height_m: Range[Height] = (0.0, 0.0)
-    """Added to the height of the camera."""
     pitch_deg: Range[Offset] = (0.0, 0.0)
-    """Added to the pitch of the camera, downwards."""
     field_of_view_scale: Range[Scale] = (1.0, 1.0)
-    """Factor on the tangent of half the field of view."""
     dirt: Range[Fraction] = (0.0, 0.0)
-    """How much darker spots of dirt on the lens are at their middle."""
     objects: Range[Objects] = (0, 0)
-    """How many boxes stand beside the road; whole numbers."""
     lens_k1: Range[Distortion] = (0.0, 0.0)
-    """Radial distortion: how much farther out the corners look than through a pinhole, as a share."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,29 +228,17 @@ class RandomizationConfig:
     """
 
     friction_scale: Range[Friction]
-    """Factor on the grip of the tyres (1: as configured for the car and the floor)."""
     mass_scale: Range[Scale]
-    """Factor on all masses and inertias."""
     motor_scale: Range[Scale]
-    """Factor on the motors' gain and largest torque."""
     servo_scale: Range[Scale]
-    """Factor on the steering servos' gain: how fast the wheels turn."""
     battery_sag: Range[Fraction]
-    """Share of the commanded speed that is lost linearly over the first 20 s of driving."""
     action_delay_steps: Range[Delay]
-    """Control steps by which commands are delayed; whole numbers."""
     steering_offset_deg: Range[Offset]
-    """Degrees added to every steering command, as by a badly calibrated centre; positive to the left."""
     steering_noise_deg: Range[Deviation]
-    """Standard deviation of the Gaussian noise added to each steering command, degrees."""
     speed_noise: Range[Fraction]
-    """Standard deviation of the Gaussian noise on each speed command, as a fraction of it."""
     observation_noise: Range[Fraction]
-    """Standard deviation of the Gaussian noise on each measured feature, in units of its scale."""
     observation_dropout: Range[Fraction]
-    """Probability at each step that the previous observation is repeated."""
     pictures: PictureRandomizationConfig | None = None
-    """Of a camera's pictures; None: nothing."""
 
 
 QUANTITIES = tuple(field.name for field in fields(RandomizationConfig) if field.name != "pictures")

@@ -42,15 +42,11 @@ class Experiment:
     """Everything that defines a run."""
 
     name: SafeName
-    """Folder under `runs_dir`, and experiment in MLflow."""
     seed: Annotated[int, Field(ge=0, lt=2**31)]
     runs_dir: Annotated[str, Field(min_length=1)]
     debug: bool
-    """Show a traceback for errors."""
     report: bool
-    """Write the report of the training at its end."""
     track: Tracks
-    """One, or several by name."""
     car: CarConfig
     action_space: ActionSpaceConfig
     observation: ObservationConfig
@@ -62,15 +58,12 @@ class Experiment:
     lr_schedule: LRScheduleConfig
     collector: CollectorConfig
     evaluation: EvaluationConfig
-    """Evaluation of the policy during training."""
     checkpoints: CheckpointsConfig
     stopping: StoppingConfig
     budget: BudgetConfig
     tracking: TrackingConfig
     teacher: Annotated[str, Field(min_length=1)] | None = None
-    """A run whose policy this one's first learns to act like."""
     device: Annotated[str, AfterValidator(_device)] = "cpu"
-    """Where updates are computed; cars, cameras and the policy that drives are on the CPU."""
 
     def __post_init__(self) -> None:
         """Refuse groups that contradict each other, such as a network that cannot read what is observed."""

@@ -20,12 +20,9 @@ class MLPConfig:
     """A multi-layer perceptron for policy and value."""
 
     hidden: Annotated[tuple[Units, ...], Field(min_length=1, max_length=8)]
-    """Units of each hidden layer."""
     activation: Literal["tanh", "relu", "elu", "silu"]
     shared_trunk: bool
-    """One trunk with two heads, instead of two separate networks."""
     initial_std: Positive
-    """Standard deviation of a continuous policy at the start, in units of the action range -1..1."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,25 +33,16 @@ class CNNConfig:
     """
 
     filters: Annotated[tuple[Annotated[int, Field(ge=1, le=512)], ...], Field(max_length=8)]
-    """Of each convolutional layer; none for a LIDAR without a camera."""
     kernels: tuple[Annotated[int, Field(ge=1, le=16)], ...]
-    """Width and height of each layer's filters."""
     strides: tuple[Annotated[int, Field(ge=1, le=8)], ...]
     hidden: Annotated[tuple[Units, ...], Field(min_length=1, max_length=8)]
-    """Units of each hidden layer after the convolutions."""
     activation: Literal["tanh", "relu", "elu", "silu"]
     critic: Literal["features", "pictures"]
-    """What the value network, which only training needs, sees; `pictures`: the same as the policy."""
     shared_trunk: bool
-    """One trunk with two heads; only where both see pictures."""
     initial_std: Positive
-    """As in `MLPConfig`."""
     attention: Units | None = None
-    """Units of the layer that scores each place of a picture; None: all places go into the perceptron."""
     lidar_hidden: Annotated[tuple[Units, ...], Field(min_length=1, max_length=8)] = (32, 32)
-    """Units of each hidden layer that sees a LIDAR alone."""
     lidar_joins_after: Annotated[int, Field(ge=0, le=7)] = 0
-    """Number of `hidden` layers that see only the camera's features; the LIDAR's join after them."""
 
     def __post_init__(self) -> None:
         """Refuse layers that are not complete, and a trunk that has nothing to share."""
@@ -91,36 +79,22 @@ class AlgorithmConfig:
 
     lr: Positive
     batch_size: Annotated[int, Field(ge=1, le=10**6)]
-    """Steps per gradient step (minibatch)."""
     epochs: UpTo1000
-    """Passes over the collected steps per iteration (`num_epochs`)."""
     discount: Fraction
-    """`discount_factor`, per control step of 1/15 s."""
     gae_lambda: Fraction
     clip_epsilon: Positive
     entropy_coeff: NonNegative
-    """`beta_entropy`."""
     entropy_end_factor: NonNegative = 1.0
-    """Factor of `entropy_coeff` at the end of the budget, reached along a straight line from 1 at its start."""
     critic_coeff: Positive
     loss_type: Literal["huber", "mean squared error"]
-    """Loss of the value network."""
     max_grad_norm: NonNegative
-    """Largest norm of a gradient step (0: unlimited)."""
     frames_per_iteration: Steps | None
-    """Control steps, over all cars, between two updates; null when episodes_per_iteration is used."""
     episodes_per_iteration: Annotated[int, Field(ge=1, le=10**5)] | None
-    """Finished episodes between two updates (`num_episodes_between_training`); null when frames are used."""
     smoothness: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.0
-    """Strength of the loss on actions that differ between neighbouring states (0: none), over the policy's own."""
     teacher_iterations: Annotated[int, Field(ge=0, le=10**6)] = 0
-    """Iterations at the start in which the policy learns to act like the teacher (0: there is none)."""
     teacher_batch_size: Annotated[int, Field(ge=1, le=10**6)] = 128
-    """Steps per gradient step in these."""
     target: Reference | None = None
-    """A class of your own in place of PPO, `package.module:Class`."""
     kwargs: dict[str, Any] = field(default_factory=dict)
-    """Keyword arguments of its constructor."""
 
     def __post_init__(self) -> None:
         """Refuse arguments for a class that is not named."""
@@ -134,7 +108,6 @@ class AlgorithmConfig:
 class _WarmedUp:
     by: By
     warmup: NonNegative
-    """Length of a linear rise from zero at the start."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,9 +142,7 @@ class AdaptiveKLLR(_WarmedUp):
     kind: Literal["adaptive_kl"]
     target_kl: Positive
     step_factor: Annotated[float, Field(gt=1, allow_inf_nan=False)]
-    """Factor of one rise or fall."""
     lowest_factor: Positive
-    """Bounds of the learning rate, relative to `algorithm.lr`."""
     highest_factor: Positive
 
 

@@ -19,15 +19,10 @@ class CollectorConfig:
     """Where experience is collected."""
 
     mode: Literal["in_process", "sync", "ray"]
-    """In this process; in several that wait for each other; like sync, on a Ray cluster."""
     processes: UpTo1000 | None
-    """Worker processes; null: one per core, as far as the cars can be dealt out evenly (not with `ray`)."""
     cars: Annotated[int, Field(ge=1, le=100_000)]
-    """Cars of all processes together."""
     threads: Annotated[int, Field(ge=0, le=1024)]
-    """Physics threads per process (0: in_process one per core, else one)."""
     hang_timeout_s: Annotated[float, Field(ge=1, le=600)]
-    """Seconds without a control step after which a worker process counts as hanging."""
 
     @property
     def forks(self) -> bool:
@@ -56,7 +51,6 @@ class MLflowTracking:
 
     kind: Literal["mlflow"]
     uri: str | None
-    """Store or server; null: SQLite in `runs_dir`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,11 +66,8 @@ class WandbTracking:
 
     kind: Literal["wandb"]
     project: Annotated[str, Field(min_length=1)]
-    """Of W&B; created if it does not exist."""
     entity: str | None
-    """User or team; null: the default of the account."""
     mode: Literal["online", "offline"]
-    """Offline: into the run folder only, for `wandb sync`."""
 
 
 PresetTracking = TrackingOff | MLflowTracking | TensorBoardTracking | WandbTracking
@@ -91,12 +82,8 @@ class CheckpointsConfig:
     """How the best policy of a run is chosen, and how many checkpoints are kept."""
 
     every: Count | None
-    """Iterations between two evaluations (group `evaluation`); the last iteration is evaluated, too. null: never;
-    the best policy is then chosen by the training's own episodes."""
     metric: Literal["race_score", "reliable_lap", "lap_time", "progress"]
-    """The metric that ranks evaluations."""
     keep: Newest
-    """How many of the newest evaluated checkpoints are kept besides the best and the last."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,19 +94,13 @@ class BudgetConfig:
     iterations: Count | None
     minutes: Positive | None
     max_cost: Positive | None
-    """In the currency of `price_per_hour`."""
     experiment_env_steps: Count | None
-    """This and the next two: limits for all runs of the same name in `runs_dir` together."""
     experiment_minutes: Positive | None
     experiment_max_cost: Positive | None
     price_per_hour: Positive | None
-    """Price of the machine; needed for limits of cost."""
     alerts: tuple[Percent, ...]
-    """Per cent of a limit at which an alert is sent."""
     alert_command: Annotated[str, Field(min_length=1)] | None
-    """A program and its arguments, run without a shell; the message and the run folder are appended."""
     alert_webhook: EnvironmentVariable | None
-    """The environment variable with the address: an address is a secret, and the config is stored."""
 
     def __post_init__(self) -> None:
         """Refuse a run without an end, and a limit of cost without a price."""

@@ -25,7 +25,6 @@ class ReliableStopping:
     kind: Literal["reliable"]
     lap_share: Fraction
     episodes: Count
-    """Number of the last finished episodes that count."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,13 +34,9 @@ class PlateauStopping:
     kind: Literal["plateau"]
     metric: Literal["completion", "mean_return", "eval_completion", "held_out_completion"]
     window: Count
-    """Iterations of the moving average."""
     warmup: Natural
-    """Iterations before the rule applies."""
     patience: Count
-    """Iterations without improvement."""
     gain: NonNegative
-    """Improvement that counts, as a share of the range so far."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,19 +46,12 @@ class ConvergedRule:
     warmup: Natural
     patience: Count
     completion_near: Percent
-    """How far completion may be below its best, in percentage points."""
     completion_gain: Percent
-    """Percentage points of completion that count as improvement."""
     return_gain: Fraction
-    """Improvement of the return that counts, as a share of the range so far."""
     laps_gain: Fraction
-    """Improvement of the laps per step that counts, as a share of their best."""
     entropy_change: NonNegative
-    """Change of the normalised entropy up to which it counts as constant."""
     best_patience: Count
-    """Iterations without a better policy, if policies are evaluated."""
     best_gain: Fraction
-    """Improvement of the race score (usual and held-out) that counts, as a share."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,9 +61,7 @@ class OverfittingRule:
     warmup: Natural
     patience: Count
     held_out_drop: Percent
-    """Drop of held-out completion below its best, in percentage points."""
     return_drop: Fraction
-    """How far the return may be below its best and still count as stable, as a share of the range so far."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,9 +71,7 @@ class LapsSlowerRule:
     warmup: Natural
     patience: Count
     slower: Fraction
-    """How much slower than the fastest laps all later ones are, as a share of the speed."""
     return_drop: Fraction
-    """How far the return may be below its best and still count as stable, as a share of the range so far."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,11 +91,8 @@ class NotLearningRule:
     warmup: Natural
     patience: Count
     entropy_near: Fraction
-    """Normalised entropy above which the policy counts as unchanged."""
     completion_gain: Percent
-    """Percentage points of completion since the start that count as learning."""
     completion_poor: Percent
-    """Completion from which on the rule no longer applies."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,9 +101,7 @@ class EntropyStopping:
 
     kind: Literal["entropy"]
     window: Count
-    """Iterations of the moving averages."""
     converged: ConvergedRule | None
-    """null: this rule never stops a run; likewise for the others."""
     overfitting: OverfittingRule | None
     collapsed: CollapsedRule | None
     not_learning: NotLearningRule | None

@@ -52,11 +52,8 @@ class RayExecutor:
 
     kind: Literal["ray"]
     address: Annotated[str, Field(min_length=1)]
-    """HOST:PORT of its head; auto: the cluster that this machine belongs to."""
     cpus_per_worker: Count
-    """Cores that a worker reserves and uses for physics."""
     gpus_per_worker: Annotated[float, Field(ge=0, allow_inf_nan=False)]
-    """GPUs that a worker reserves, or the share of one."""
 
 
 ExecutorConfig = Annotated[LocalExecutor | RayExecutor, Field(discriminator="kind")]
@@ -67,42 +64,25 @@ class SweepConfig:
     """The search space, how it is searched, and when the search ends."""
 
     trials: Annotated[int, Field(ge=1, le=100_000)]
-    """Total number, over all starts of the study."""
     workers: UpTo1000 | None
-    """Worker processes; null: one a core, on a cluster as many as fit."""
     seeds: UpTo100
-    """Number of seeds a trial is trained with; its value is their mean."""
     protocol: str
-    """Option of `evaluation` by which trials are judged."""
     objectives: Annotated[tuple[Objective, ...], Field(min_length=1)]
-    """Several give a Pareto front instead of one best trial."""
     rerank: Annotated[int, Field(ge=0, le=1000)]
-    """Number of the best trials that are evaluated again at the end."""
     rerank_laps: Annotated[int, Field(ge=1, le=4096)]
-    """Trials of that evaluation, on each track and condition."""
     sampler: Sampler
     seed: Annotated[int, Field(ge=0, lt=2**31)]
-    """Seed of the sampler."""
     startup_trials: Natural
-    """Trials before the sampler uses results and pruners compare."""
     pruners: tuple[Pruner, ...]
     percentile: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)]
-    """Per cent of the trials that the percentile pruner keeps."""
     warmup_evaluations: Natural
-    """Evaluations of a trial before it can be pruned."""
     patience: Natural | None
-    """Evaluations without improvement before it can be pruned; null: it can be pruned while it improves."""
     lease_s: Seconds
-    """Seconds without a heartbeat after which another worker may take over a trial."""
     patience_s: Seconds
-    """Seconds to wait for a database that does not answer."""
     storage: Annotated[str, Field(min_length=1)] | None
-    """Address of the database; null: a file in `runs_dir`."""
     executor: ExecutorConfig
     train: tuple[str, ...]
-    """Overrides of every trial."""
     space: dict[str, str]
-    """The search space: expressions of Hydra's grammar by key."""
 
     def __post_init__(self) -> None:
         """Refuse names that are listed twice."""
@@ -117,11 +97,8 @@ class SweepEntry:
     """The request of `deepracer-exp sweep`."""
 
     study: SafeName | None
-    """Name of the study, and of the experiment of its runs."""
     parent: Annotated[str, Field(min_length=1)] | None
-    """The run that every trial clones."""
     debug: bool
-    """Show a traceback for errors."""
     sweep: SweepConfig
 
 
