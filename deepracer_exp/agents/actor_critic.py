@@ -105,10 +105,12 @@ def build_actor_critic(
         keys = list(observed.seen)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(torch.randint(2**62, (), generator=generator)))
-            own, value = (_own_network(network, observed, size) for size in (outputs, 1))
+            policy_network, value = (_own_network(network, observed, size) for size in (outputs, 1))
         with reading(f"network.target={network.target}: initial_std"):
-            initial_std = float(getattr(own, "initial_std", _INITIAL_STD))
-        return ActorCritic(_policy(keys, own, continuous, initial_std), ValueOperator(value, in_keys=keys))
+            initial_std = float(getattr(policy_network, "initial_std", _INITIAL_STD))
+        return ActorCritic(
+            _policy(keys, policy_network, continuous, initial_std), ValueOperator(value, in_keys=keys)
+        )
     keys = list(observed.seen) if isinstance(network, CNNConfig) else ["observation"]
 
     def layers(outputs: int | None, gain: float) -> nn.Module:
@@ -141,18 +143,18 @@ def _own_network(network: OwnClass, observed: ObservationShape, outputs: int) ->
     """Build a network of the user's own and call a copy of it, with two observations."""
     # The number itself where an input has only one axis.
     inputs = [shape if len(shape) > 1 else shape[0] for shape in observed.seen.values()]
-    own = build_own(network, "network.target", nn.Module, *inputs, outputs)
+    built = build_own(network, "network.target", nn.Module, *inputs, outputs)
     seen = [
         torch.zeros(2, *shape, dtype=torch.uint8 if key == "pixels" else torch.float32)
         for key, shape in observed.seen.items()
     ]
     what = f"network.target={network.target}"
     with reading(what), torch.no_grad():
-        found = copy.deepcopy(own).eval()(*seen)
-    shape = tuple(found.shape) if isinstance(found, Tensor) else type(found).__name__
+        output = copy.deepcopy(built).eval()(*seen)
+    shape = tuple(output.shape) if isinstance(output, Tensor) else type(output).__name__
     if shape != (2, outputs):
         raise BadInput(what, f"returns {shape} for two observations", f"a tensor of shape (2, {outputs})")
-    return own
+    return built
 
 
 def _dense(inputs: int, hidden: tuple[int, ...], activation: str, outputs: int | None = None) -> MLP:

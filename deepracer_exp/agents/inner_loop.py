@@ -114,10 +114,10 @@ class InnerLoop:
             if not state[parameter]:
                 zeros = torch.zeros_like(parameter)
                 state[parameter] = {"step": torch.tensor(0.0), "exp_avg": zeros, "exp_avg_sq": zeros.clone()}
-            own = state[parameter]
-            tensors = (parameter.detach(), torch.from_numpy(gradient), own["exp_avg"], own["exp_avg_sq"])
+            adam = state[parameter]
+            tensors = (parameter.detach(), torch.from_numpy(gradient), adam["exp_avg"], adam["exp_avg_sq"])
             rows.append(tuple(tensor.view(-1).numpy() for tensor in tensors))
-        return tuple(zip(*rows, strict=True)), int(own["step"])
+        return tuple(zip(*rows, strict=True)), int(adam["step"])
 
 
 def _is_plain(layers: nn.Module) -> bool:
@@ -298,15 +298,15 @@ def _differentiate(  # type: ignore[no-untyped-def]
                 by_outputs[step, axis] = by_log_prob * apart * shrink
                 by_log_std[axis] += by_log_prob * (apart * apart - 1.0)
         else:
-            own = 0.0
+            step_entropy = 0.0
             for index in range(size):
                 log_p = outputs[step, index] - normal
-                own -= math.exp(log_p) * log_p
-            entropy += own / count
+                step_entropy -= math.exp(log_p) * log_p
+            entropy += step_entropy / count
             for index in range(size):
                 log_p = outputs[step, index] - normal
                 p = math.exp(log_p)
-                by_outputs[step, index] = p * ((log_p + own) * entropy_coeff / count - by_log_prob)
+                by_outputs[step, index] = p * ((log_p + step_entropy) * entropy_coeff / count - by_log_prob)
             by_outputs[step, action[step]] += by_log_prob
     if action.ndim == 2:
         for axis in range(size):

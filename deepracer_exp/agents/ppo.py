@@ -244,10 +244,10 @@ class PPO(Algorithm):
             index: {key: value.cpu() for key, value in state.items()}
             for index, state in optimizer["state"].items()
         }
-        own = {"optimizer": {**optimizer, "state": moments}, "generator": self._generator.get_state()}
+        updating = {"optimizer": {**optimizer, "state": moments}, "generator": self._generator.get_state()}
         if self._smoothness is not None:
-            own["smoothness"] = self._smoothness.state_dict()
-        return super().state_dict() | own
+            updating["smoothness"] = self._smoothness.state_dict()
+        return super().state_dict() | updating
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over a `state_dict`; further updates are those of the original bit for bit."""
@@ -468,11 +468,11 @@ def build_agent(
     elif config.target is None:
         agent = PPO(actor_critic, config, schedule, seed, device)
     else:
-        own = OwnClass(target=config.target, kwargs=config.kwargs)
+        described = OwnClass(target=config.target, kwargs=config.kwargs)
         # Its constructor may draw weights; the global random state has no part in them.
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            agent = build_own(own, "algorithm.target", Algorithm, actor_critic, config, schedule, seed)
+            agent = build_own(described, "algorithm.target", Algorithm, actor_critic, config, schedule, seed)
     if config.smoothness:
         if not isinstance(agent, PPO):
             raise BadInput(f"algorithm.smoothness={config.smoothness:g}", f"{config.target} is no PPO", "0")

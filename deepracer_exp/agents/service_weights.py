@@ -108,13 +108,13 @@ def from_service(
 ) -> None:
     """Give networks the parameters of the service's tensors; arguments and errors as of `match_service`."""
     layers, scale = _layers(networks, sensors)
-    found, _ = match_service(tensors, networks, sensors, where)
+    matched, _ = match_service(tensors, networks, sensors, where)
     with torch.no_grad():
         for layer in layers:
-            if f"{layer.name}/kernel" in found:
-                layer.from_service(found[f"{layer.name}/kernel"], found[f"{layer.name}/bias"])
-        if scale is not None and _LOG_STD in found:
-            clipped = np.clip(found[_LOG_STD][0], *_LOG_STD_RANGE)
+            if f"{layer.name}/kernel" in matched:
+                layer.from_service(matched[f"{layer.name}/kernel"], matched[f"{layer.name}/bias"])
+        if scale is not None and _LOG_STD in matched:
+            clipped = np.clip(matched[_LOG_STD][0], *_LOG_STD_RANGE)
             scale.state_independent_scale.copy_(torch.from_numpy(clipped))
 
 
@@ -143,48 +143,48 @@ def match_service(
     targets = {name: shape for layer in layers for name, shape in layer.shapes.items()}
     if scale is not None:
         targets[_LOG_STD] = (1, *scale.scale_shape)
-    found = _match(tensors, targets, where)
-    missing = [name for name in targets if name not in found]
-    absent = [VALUE] if all(_scope(name) != VALUE for name in found) else []
+    matched = _match(tensors, targets, where)
+    missing = [name for name in targets if name not in matched]
+    absent = [VALUE] if all(_scope(name) != VALUE for name in matched) else []
     absent += [_LOG_STD] * (_LOG_STD in missing)
     for name in missing:
         if name != _LOG_STD and _scope(name) not in absent:
             raise BadInput(where, f"has no tensor {name} of shape {list(targets[name])}")
-    for name, value in found.items():
+    for name, value in matched.items():
         if not np.isfinite(value).all():
             raise BadInput(where, f"{name}: is not finite; choose another checkpoint")
-    return found, absent
+    return matched, absent
 
 
 def _match(
     tensors: Mapping[str, Array], targets: Mapping[str, tuple[int, ...]], where: str
 ) -> dict[str, Array]:
     """Return the tensors under the names of `targets`."""
-    given: dict[str, Array] = {}
+    unmatched: dict[str, Array] = {}
     for name, value in tensors.items():
         ours = re.sub(r"^main_level/agent(?:_\d+)?/main/(?:online|global)/", f"{ONLINE}/", name)
         if _UNUSED.search(name) or ours.endswith(f"/{_RESCALER}"):
             continue
-        if ours in given:
+        if ours in unmatched:
             raise BadInput(where, f"{name}: is of a second agent", "a model of one")
-        given[ours] = value
-    found = {name: given.pop(name) for name in targets if name in given}
+        unmatched[ours] = value
+    matched = {name: unmatched.pop(name) for name in targets if name in unmatched}
     for name, shape in targets.items():
-        if name not in found:
-            alike = (one for one in sorted(given, key=natural) if _unnumbered(one) == _unnumbered(name))
-            match = next((one for one in alike if given[one].shape == shape), None)
+        if name not in matched:
+            alike = (key for key in sorted(unmatched, key=natural) if _unnumbered(key) == _unnumbered(name))
+            match = next((key for key in alike if unmatched[key].shape == shape), None)
             if match is not None:
-                found[name] = given.pop(match)
-    for name, value in found.items():
+                matched[name] = unmatched.pop(match)
+    for name, value in matched.items():
         if value.shape != targets[name]:
             raise BadInput(where, f"{name}: has the shape {list(value.shape)}", list(targets[name]))
-    if given:
-        name = min(given)
+    if unmatched:
+        name = min(unmatched)
         raise BadInput(
             where,
-            f"{name}: a tensor of shape {list(given[name].shape)} that the network of these files has no layer for",
+            f"{name}: a tensor of shape {list(unmatched[name].shape)} that the network of these files has no layer for",
         )
-    return found
+    return matched
 
 
 def _unnumbered(name: str) -> str:
@@ -217,7 +217,7 @@ def _layers(
 
 
 def _last(module: nn.Module, name: str) -> _Layer:
-    return _Layer(name, [one for one in module.modules() if isinstance(one, nn.Linear)][-1])
+    return _Layer(name, [layer for layer in module.modules() if isinstance(layer, nn.Linear)][-1])
 
 
 def _trunk(net: nn.Module, scope: str, sensors: Sequence[str]) -> Iterator[_Layer]:
@@ -227,8 +227,8 @@ def _trunk(net: nn.Module, scope: str, sensors: Sequence[str]) -> Iterator[_Laye
             "network: sees features or is a class of your own, and models of the service see a camera; accepted: a run "
             "with a camera and network=shallow, medium, deep or cnn_small"
         )
-    known = (nn.Conv2d, nn.Linear, nn.ReLU, nn.Sequential, nn.Identity, SensorNet)
-    odd = [one for one in net.modules() if not isinstance(one, known)]
+    readable = (nn.Conv2d, nn.Linear, nn.ReLU, nn.Sequential, nn.Identity, SensorNet)
+    odd = [part for part in net.modules() if not isinstance(part, readable)]
     if odd:
         raise BadInput(
             f"network: has {type(odd[0]).__name__} layers; the service's networks have only convolutions, dense layers "
@@ -239,25 +239,25 @@ def _trunk(net: nn.Module, scope: str, sensors: Sequence[str]) -> Iterator[_Laye
             "network.lidar_joins_after: not 0; in the service's networks the LIDAR joins right after the convolutions"
         )
     order: dict[str, npt.NDArray[np.int64]] = {}
-    dense = [one for one in net.perceptron if isinstance(one, nn.Linear)]
+    dense = [layer for layer in net.perceptron if isinstance(layer, nn.Linear)]
     readings = 0
     if net.has_lidar:
         (lidar,) = (name for name in sensors if name in LIDARS)
-        alone = [one for one in net.lidar if isinstance(one, nn.Linear)]
+        alone = [layer for layer in net.lidar if isinstance(layer, nn.Linear)]
         for number, module in enumerate(alone):
             yield _Layer(f"{scope}/{lidar}/Dense_{2 * number}", module)
         readings = alone[-1].out_features
         order[lidar] = np.arange(dense[0].in_features - readings, dense[0].in_features)
     if net.has_picture:
         (camera,) = (name for name in sensors if name in CAMERAS)
-        convolutions = [one for one in net.convolutions if isinstance(one, nn.Conv2d)]
+        convolutions = [layer for layer in net.convolutions if isinstance(layer, nn.Conv2d)]
         seen, accepted = convolutions[0].in_channels, 2 if camera == "STEREO_CAMERAS" else 1
         if seen != accepted:
             raise BadInput(
                 f"observation.camera: the policy sees {seen} channels; with {camera} the service's models see "
                 f"{accepted}: color=grey, frames=1"
             )
-        wide = [number for number, one in enumerate(convolutions) if one.kernel_size != (1, 1)]
+        wide = [number for number, layer in enumerate(convolutions) if layer.kernel_size != (1, 1)]
         for number, convolution in enumerate(convolutions):
             kind = "Conv2d" if number <= max(wide, default=0) else "Dense"
             yield _Layer(f"{scope}/{camera}/{kind}_{2 * number}", convolution)

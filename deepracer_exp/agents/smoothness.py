@@ -119,17 +119,17 @@ class Smoothness:
             return parameters["loc"]
         return (parameters["logits"] / TEMPERATURE).softmax(-1)
 
-    def _distance(self, one: Tensor, other: Tensor) -> Tensor:
-        """Return the mean distance of actions, both as `_actions` returns them."""
+    def _distance(self, actions: Tensor, others: Tensor) -> Tensor:
+        """Return the mean distance between two batches of actions, both as `_actions` returns them."""
         if self._distances is None:
             # Its gradient at 0 must exist.
-            return ((one - other).square().sum(-1) + _ROUNDING**2).sqrt().mean()
-        return ((one @ self._distances) * other).sum(-1).mean()
+            return ((actions - others).square().sum(-1) + _ROUNDING**2).sqrt().mean()
+        return ((actions @ self._distances) * others).sum(-1).mean()
 
     def _length(self, loss: Tensor) -> Tensor:
         """Return the length of a loss's gradient over the policy's parameters."""
         gradients = torch.autograd.grad(loss, self._parameters, retain_graph=True, allow_unused=True)
-        return torch.nn.utils.get_total_norm([one for one in gradients if one is not None])
+        return torch.nn.utils.get_total_norm([gradient for gradient in gradients if gradient is not None])
 
     def _variant(self, steps: TensorDictBase) -> TensorDict:
         """Return what the policy could have seen instead: features and readings with noise, other pictures."""

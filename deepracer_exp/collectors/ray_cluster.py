@@ -27,15 +27,16 @@ def connect(address: str, asked_by: str) -> None:
     ray_constants.NUM_REDIS_GET_RETRIES = 1
     if ray.is_initialized():
         return
-    known = os.environ.get("RAY_ADDRESS", address) if address == "auto" else address
+    reachable = os.environ.get("RAY_ADDRESS", address) if address == "auto" else address
     try:
-        if known != "auto":
-            _knock(known)
-        ray.init(known, log_to_driver=False, logging_level="error")
+        if reachable != "auto":
+            _knock(reachable)
+        ray.init(reachable, log_to_driver=False, logging_level="error")
     except (OSError, RuntimeError, ValueError) as error:
         reason = " ".join(str(error).split()).split(". ")[0].rstrip(".")
         raise BadInput(
-            f"{asked_by}: no Ray cluster at {known}: {reason}; start one with: ray start --head --disable-usage-stats"
+            f"{asked_by}: no Ray cluster at {reachable}: {reason}; start one with: ray start --head "
+            "--disable-usage-stats"
         ) from None
 
 

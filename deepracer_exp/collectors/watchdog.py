@@ -95,7 +95,7 @@ class Watchdog:
                 self._end(int(worker), float(idle_s[worker]), int(beats[worker]))
 
     def _end(self, worker: int, idle_s: float, steps: int) -> None:
-        known = worker in self.verdict
+        is_first = worker in self.verdict
         # Before the kill: the collector reads the verdict as soon as it sees the death.
         self.verdict[worker] = f"took no step for {idle_s:.0f} s (after {max(steps, 0)} steps) and was ended"
         if self._processes is None:
@@ -104,7 +104,7 @@ class Watchdog:
             for process in multiprocessing.active_children():
                 process.kill()
             _end_fork_servers_children()
-        elif not known:
+        elif not is_first:
             with contextlib.suppress(ValueError):  # a handle that TorchRL has closed
                 self._processes[worker].kill()
 

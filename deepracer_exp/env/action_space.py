@@ -109,7 +109,9 @@ def build_action_space(config: ActionSpaceConfig) -> ActionSpace:
                 f"action_space.{key}", f"low {bounds.low:g} is above high {bounds.high:g}", "low <= high"
             )
     if isinstance(config, ContinuousActionSpace):
-        low, high = (np.array([getattr(one, end) for one in (steering, speed)]) for end in ("low", "high"))
+        low, high = (
+            np.array([getattr(action, end) for action in (steering, speed)]) for end in ("low", "high")
+        )
         return ContinuousActions(low.astype(np.float64), high.astype(np.float64))
     angles = _levels("steering", steering, config.steering_levels)
     speeds = _levels("speed", speed, config.speed_levels)

@@ -57,7 +57,7 @@ class Lidar:
             row[: len(some)] = some
         self._segments = np.empty((len(self._cars), self._walls.shape[1] + 4 * boxes, 4))
         self._scans_per_step = SCANS_PER_S * period_s
-        self._noise_at = np.zeros(len(self._cars), np.int64)
+        self._noise_start = np.zeros(len(self._cars), np.int64)
         self._noise = np.random.default_rng(0).standard_normal(_NOISE_NUMBERS)
 
     def seed(self, seed: int) -> None:
@@ -82,7 +82,7 @@ class Lidar:
         walls = self._walls[course]
         self._segments[ids] = walls if boxes is None else np.hstack([walls, box_sides(boxes)])
         for car, episode in zip(ids.tolist(), episodes.tolist(), strict=True):
-            self._noise_at[car] = self._streams.at(car, episode).integers(_NOISE_NUMBERS)
+            self._noise_start[car] = self._streams.stream(car, episode).integers(_NOISE_NUMBERS)
 
     def read(self, ids: Ids, state: CarState, steps: NDArray[np.int64]) -> Readings:
         """Return the readings of new scans by the cars `ids`, (n, size).
@@ -102,8 +102,8 @@ class Lidar:
         )
         distances = scan(poses, self._segments[ids])
         distances[distances > FURTHEST_M] = np.inf
-        at = self._noise_at[ids] + _NEXT_SCAN * steps
-        noise = self._noise[(at[:, None] + np.arange(RAYS)) % _NOISE_NUMBERS]
+        counter = self._noise_start[ids] + _NEXT_SCAN * steps
+        noise = self._noise[(counter[:, None] + np.arange(RAYS)) % _NOISE_NUMBERS]
         return readings(self._config, distances + self._config.noise_m * noise)
 
     def next(

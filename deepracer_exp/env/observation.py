@@ -41,9 +41,12 @@ def build_parts(config: ObservationConfig) -> tuple[ObservationPart, ...]:
     return tuple(map(_build_part, config.parts))
 
 
-def _build_part(own: OwnClass) -> ObservationPart:
+def _build_part(described: OwnClass) -> ObservationPart:
     """Build a part and compute the features of two cars: numpy would stretch a column to those that are missing."""
-    part, what = build_own(own, "observation.target", ObservationPart), f"observation.target={own.target}"
+    part, what = (
+        build_own(described, "observation.target", ObservationPart),
+        f"observation.target={described.target}",
+    )
     names = part.names
     if not isinstance(names, tuple | list) or not names or not all(isinstance(name, str) for name in names):
         raise BadInput(what, f"names={names!r}", 'a tuple of text, as in names = ("side_force",)')

@@ -59,7 +59,10 @@ class PictureRandomization:
         """Take each car's ranges and its number over all processes; call `seed` and then `begin` next."""
         none = np.stack([_OFF, _OFF], axis=1)
         ranges = np.array(
-            [none if one is None else [getattr(one, name) for name in QUANTITIES] for one in configs],
+            [
+                none if config is None else [getattr(config, name) for name in QUANTITIES]
+                for config in configs
+            ],
             np.float64,
         )
         self._low: Floats = ranges[..., 0]
@@ -70,7 +73,7 @@ class PictureRandomization:
         self._color_factor = np.ones((n_cars, len(MATERIALS), 3))
         # Depth (negative: a shadow), middle as shares of width and height, and size as a share of the width.
         self._spot = np.zeros((n_cars, 4))
-        self._noise_at = np.zeros(n_cars, np.int64)
+        self._noise_start = np.zeros(n_cars, np.int64)
         # Middle as shares of width and height, and size as a share of the width.
         self._dirt = np.zeros((n_cars, _DIRT_SPOTS, 3))
         self.most_boxes = most = int(ranges[:, _COLUMN["objects"], 1].max())
@@ -89,14 +92,14 @@ class PictureRandomization:
         draws = np.empty(len(QUANTITIES))
         normal = np.empty(self._color_factor.shape[1:])
         for car, episode, track in zip(ids.tolist(), episodes.tolist(), course.tolist(), strict=True):
-            stream = self._streams.at(car, episode)
+            stream = self._streams.stream(car, episode)
             stream.random(out=draws[:_FIRST_QUANTITIES])
             stream.standard_normal(out=normal[:_FIRST_MATERIALS])
             sign, x, y, size = stream.random(4)
-            self._noise_at[car] = stream.integers(_NOISE_NUMBERS)
+            self._noise_start[car] = stream.integers(_NOISE_NUMBERS)
             stream.random(out=draws[_FIRST_QUANTITIES:_LENS])
             stream.standard_normal(out=normal[_FIRST_MATERIALS:])
-            draws[_LENS] = self._lens_streams.at(car, episode).random()
+            draws[_LENS] = self._lens_streams.stream(car, episode).random()
             values = self._low[car] + self._span[car] * draws
             self._values[car] = values
             self._color_factor[car] = 1.0 + values[_COLUMN["color_noise"]] * normal[_FACTOR_OF]
@@ -159,9 +162,9 @@ class PictureRandomization:
         dirt = self._of("dirt", ids)
         if dirt.any():
             _soil(pictures, self._dirt[ids], dirt)
-        noise_at = (self._noise_at[ids] + _NEXT_PICTURE * steps) % _NOISE_NUMBERS
+        noise_start = (self._noise_start[ids] + _NEXT_PICTURE * steps) % _NOISE_NUMBERS
         blur, noise = self._of("blur", ids), 255 * self._of("pixel_noise", ids)
-        return _disturb(pictures, self._spot[ids], blur, noise, self._noise, noise_at)
+        return _disturb(pictures, self._spot[ids], blur, noise, self._noise, noise_start)
 
     def _of(self, name: str, ids: Ids) -> Floats:
         return self._values[ids, _COLUMN[name]]
@@ -198,11 +201,11 @@ def _distort(pictures, k1s):  # type: ignore[no-untyped-def]
     last_x, last_y = np.float32(width - 1.001), np.float32(height - 1.001)
     places = np.empty(width, np.int32)
     across, down = np.empty(width, np.float32), np.empty(width, np.float32)
-    for at in range(count):
-        if k1s[at] == 0.0:
+    for car in range(count):
+        if k1s[car] == 0.0:
             continue
-        shrunk = np.float32(1.0 / (1.0 + max(k1s[at], 0.0)))
-        per_square = np.float32(shrunk * k1s[at] * 4.0 / (width * width + height * height))
+        shrunk = np.float32(1.0 / (1.0 + max(k1s[car], 0.0)))
+        per_square = np.float32(shrunk * k1s[car] * 4.0 / (width * width + height * height))
         for row in range(height):
             y = np.float32(row) - middle_y
             for column in range(width):
@@ -215,7 +218,7 @@ def _distort(pictures, k1s):  # type: ignore[no-untyped-def]
                 places[column] = top * np.int32(width) + left
             # A loop of its own, so that the one above is vectorised.
             for channel in range(channels):
-                flat = pictures[at, channel].reshape(-1)
+                flat = pictures[car, channel].reshape(-1)
                 for column in range(width):
                     place = np.uint64(places[column])
                     above = np.float32(flat[place])
@@ -224,7 +227,7 @@ def _distort(pictures, k1s):  # type: ignore[no-untyped-def]
                     below_right = np.float32(flat[place + np.uint64(width + 1)])
                     above += across[column] * (above_right - above)
                     below += across[column] * (below_right - below)
-                    out[at, channel, row, column] = np.uint8(
+                    out[car, channel, row, column] = np.uint8(
                         above + down[column] * (below - above) + np.float32(0.5)
                     )
     return out
@@ -235,40 +238,40 @@ def _soil(pictures, spots, depths):  # type: ignore[no-untyped-def]
     """Darken spots of the pictures."""
     count, channels, height, width = pictures.shape
     across = np.empty(width, np.float32)
-    for at in range(count):
-        for x, y, size in spots[at] if depths[at] > 0 else spots[at, :0]:
+    for car in range(count):
+        for x, y, size in spots[car] if depths[car] > 0 else spots[car, :0]:
             reach = 3 * size * width
             first, last = max(int(x * width - reach), 0), min(int(x * width + reach), width)
             for column in range(first, last):
                 across[column] = np.exp(-0.5 * (((column + 0.5) / width - x) / size) ** 2)
             for row in range(max(int(y * height - reach), 0), min(int(y * height + reach), height)):
                 down = np.float32(
-                    depths[at] * np.exp(-0.5 * (((row + 0.5) / width - y * height / width) / size) ** 2)
+                    depths[car] * np.exp(-0.5 * (((row + 0.5) / width - y * height / width) / size) ** 2)
                 )
                 for channel in range(channels):
                     for column in range(first, last):
                         left = np.float32(1) - down * across[column]
-                        pictures[at, channel, row, column] = np.uint8(
-                            left * np.float32(pictures[at, channel, row, column]) + np.float32(0.5)
+                        pictures[car, channel, row, column] = np.uint8(
+                            left * np.float32(pictures[car, channel, row, column]) + np.float32(0.5)
                         )
 
 
 @njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
-def _disturb(pictures, spots, blurs, deviations, numbers, noise_at):  # type: ignore[no-untyped-def]
+def _disturb(pictures, spots, blurs, deviations, numbers, noise_start):  # type: ignore[no-untyped-def]
     """Return the pictures with light, blur and noise."""
     count, channels, height, width = pictures.shape
     out = np.empty_like(pictures)
     across = np.empty(width, np.float32)
-    for at in range(count):
-        depth, x, y, size = spots[at]
-        side = np.float32(0.25 * blurs[at])
-        own = np.float32(1.0 - blurs[at])
-        deviation = np.float32(deviations[at])
+    for car in range(count):
+        depth, x, y, size = spots[car]
+        side = np.float32(0.25 * blurs[car])
+        center = np.float32(1.0 - blurs[car])
+        deviation = np.float32(deviations[car])
         for column in range(width):
             across[column] = np.exp(-0.5 * (((column + 0.5) / width - x) / size) ** 2)
-        number = noise_at[at]
+        number = noise_start[car]
         for channel in range(channels):
-            picture = pictures[at, channel]
+            picture = pictures[car, channel]
             for row in range(height):
                 above, below = picture[max(row - 1, 0)], picture[min(row + 1, height - 1)]
                 middle = picture[row]
@@ -284,9 +287,9 @@ def _disturb(pictures, spots, blurs, deviations, numbers, noise_at):  # type: ig
                         + np.float32(middle[max(column - 1, 0)])
                         + np.float32(middle[min(column + 1, width - 1)])
                     )
-                    value = own * np.float32(middle[column]) + side * around
+                    value = center * np.float32(middle[column]) + side * around
                     value *= np.float32(1.0) + down * across[column]
                     value += deviation * numbers[number + column] + np.float32(0.5)
-                    out[at, channel, row, column] = np.uint8(min(max(value, np.float32(0)), np.float32(255)))
+                    out[car, channel, row, column] = np.uint8(min(max(value, np.float32(0)), np.float32(255)))
                 number += width
     return out

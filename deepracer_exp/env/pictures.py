@@ -163,4 +163,4 @@ def floor_colors(floor: FloorConfig) -> NDArray[np.float32]:
 
 
 def _rgb(color: str) -> NDArray[np.float32]:
-    return np.array([int(color[at : at + 2], 16) for at in (1, 3, 5)], np.float32)
+    return np.array([int(color[begin : begin + 2], 16) for begin in (1, 3, 5)], np.float32)

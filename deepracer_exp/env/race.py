@@ -105,12 +105,12 @@ class Race:
         self.observation = np.zeros((n_cars, len(self._features.names)), np.float32)
         camera, tracks = setup.observation.camera, [course.tracks[0] for course in setup.courses]
         real_car = setup.real_car
-        pictures = [one.pictures for one in randomizations]
+        pictures = [randomization.pictures for randomization in randomizations]
         lidar = setup.observation.lidar
         seen = camera is not None or lidar is not None
         self._varied = (
             PictureRandomization(pictures, self.cars.tolist(), tracks)
-            if seen and any(one is not None for one in pictures)
+            if seen and any(config is not None for config in pictures)
             else None
         )
         of_car = None if real_car is None else real_car.picture

@@ -59,7 +59,7 @@ class CarStreams:
         self._generator = np.random.Generator(self._philox)
         self._state = self._philox.state
 
-    def at(self, place: int, number: int) -> np.random.Generator:
+    def stream(self, place: int, number: int) -> np.random.Generator:
         """Return a generator, always the same object, at the start of stream `number` of the car `cars[place]`."""
         # A key and a counter are the whole state of Philox. Ten times faster than a new generator.
         self._state["state"] = {
@@ -89,7 +89,7 @@ class StepNoise:
         number, place = divmod(self.steps, _BLOCK)
         if number != self._block_number:
             for car, numbers in enumerate(self._block):
-                self._streams.at(car, number).standard_normal(out=numbers)
+                self._streams.stream(car, number).standard_normal(out=numbers)
             self._block_number = number
         self.steps += 1
         return self._block[:, place]
@@ -192,7 +192,7 @@ class Randomization:
             return
         uniform = np.empty((len(ids), len(QUANTITIES)))
         for row, (place, episode) in enumerate(zip(ids.tolist(), episodes.tolist(), strict=True)):
-            stream = self._episodes.at(place, episode)
+            stream = self._episodes.stream(place, episode)
             # All quantities are drawn, so that switching one on does not change the others.
             stream.random(out=uniform[row])
             if noisy:

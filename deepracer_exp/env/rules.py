@@ -213,11 +213,11 @@ class RaceRules:
         episode = self.episode[ids]
         if course is not None:
             self.course[ids] = course
-        own = self.course[ids]
+        courses = self.course[ids]
         track_index = self.track_index[ids] = (
-            self._first_track[own] + self._driven[ids, own] % self._turns[own]
+            self._first_track[courses] + self._driven[ids, courses] % self._turns[courses]
         )
-        self._driven[ids, own] += 1
+        self._driven[ids, courses] += 1
         if start_ndist is None:
             # An open course is driven from its start: from anywhere else it could not be completed.
             turns = np.where(self.tracks.closed[track_index], self.cars[ids] + episode, 0)
@@ -255,8 +255,8 @@ class RaceRules:
         The measurements are part of it: cars may have been measured apart from others, and NumPy does not promise the
         same last bit for an array of another length.
         """
-        own = {key: getattr(self, name).copy() for name, key in _KEPT.items()}
-        return {**own, "rules": self._episode_rules.state_dict(), "now": self.now.state_dict()}
+        kept = {key: getattr(self, name).copy() for name, key in _KEPT.items()}
+        return {**kept, "rules": self._episode_rules.state_dict(), "now": self.now.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore a `state_dict`.

@@ -26,10 +26,10 @@ def checked_array(state: Mapping[str, Any], name: str, shape: tuple[int, ...]) -
         BadInput: there is none, or it has another shape.
     """
     array = state.get(name)
-    found = f"shape {array.shape}" if isinstance(array, np.ndarray) else "no array"
+    actual = f"shape {array.shape}" if isinstance(array, np.ndarray) else "no array"
     if not isinstance(array, np.ndarray) or array.shape != shape:
         raise BadInput(
-            f"the checkpoint does not fit: '{name}' of its cars has {found}, these cars need {shape}; accepted: a "
+            f"the checkpoint does not fit: '{name}' of its cars has {actual}, these cars need {shape}; accepted: a "
             "checkpoint of as many cars, on the same tracks, with the same features"
         )
     return array.copy()

@@ -50,12 +50,12 @@ def results_table(
     groups = [(f"{group.track}{' *' * (group.track in unseen)}", group) for group in evaluation.groups]
     if len(evaluation.tracks) > 1:
         groups += [("all", evaluation.on(condition)) for condition in evaluation.conditions]
-    found = [(label, group.condition.replace("_", " "), group.statistics()) for label, group in groups]
+    lines = [(label, group.condition.replace("_", " "), group.statistics()) for label, group in groups]
     penalties = any(vars(config.penalty_s).values())
     hidden = (() if config.resets_per_lap else ("resets",)) + (() if penalties else ("penalty s",))
 
     def lay_out(intervals: bool, left_out: Sequence[str]) -> Table:
-        rows = [(label, condition, _cells(numbers, intervals)) for label, condition, numbers in found]
+        rows = [(label, condition, _cells(numbers, intervals)) for label, condition, numbers in lines]
         names = [name for name in rows[0][2] if name not in left_out]
         notes = [
             f"in brackets: {CONFIDENCE:.0%} interval of the mean, by bootstrap over the trials"
@@ -120,7 +120,9 @@ def write_evaluation(
     if car is not None:
         content["real_car"] = car_figures(car)
     if places:
-        content["boards"] = {track: [one.as_dict() for one in found] for track, found in places.items()}
+        content["boards"] = {
+            track: [place.as_dict() for place in on_track] for track, on_track in places.items()
+        }
     target = folder / EVALUATIONS
     with writing(target, failure=RunFailed):
         target.mkdir(exist_ok=True)
@@ -129,28 +131,28 @@ def write_evaluation(
         return atomic_write(target / f"{name}.json", json.dumps(content, indent=2) + "\n")
 
 
-def _cells(found: Mapping[str, Any], intervals: bool) -> dict[str, str]:
+def _cells(statistics: Mapping[str, Any], intervals: bool) -> dict[str, str]:
     """Return a group's cells by column."""
-    times = found["lap_time_s"]
+    times = statistics["lap_time_s"]
     return {
-        "laps": f"{found['laps']} of {found['laps_tried']}",
-        "done %": _mean(found["completion"], 1, intervals),
+        "laps": f"{statistics['laps']} of {statistics['laps_tried']}",
+        "done %": _mean(statistics["completion"], 1, intervals),
         "lap s": _mean(times, 2, intervals),
         "median": number(times["median"], 2),
         "best": number(times["best"], 2),
         "std": number(times["std"], 2),
-        "resets": _mean(found["resets"], 1, intervals),
-        "penalty s": _mean(found["penalty_s"], 1, intervals),
-        "score s": number(found["race_score_s"], 2),
-        "zig-zag /m": _mean(found["zigzag"]["changes_per_m"], 2, intervals),
+        "resets": _mean(statistics["resets"], 1, intervals),
+        "penalty s": _mean(statistics["penalty_s"], 1, intervals),
+        "score s": number(statistics["race_score_s"], 2),
+        "zig-zag /m": _mean(statistics["zigzag"]["changes_per_m"], 2, intervals),
     }
 
 
-def _mean(found: Mapping[str, Any], digits: int, intervals: bool) -> str:
-    mean = number(found["mean"], digits)
-    if found["interval"] is None or not intervals:
+def _mean(statistics: Mapping[str, Any], digits: int, intervals: bool) -> str:
+    mean = number(statistics["mean"], digits)
+    if statistics["interval"] is None or not intervals:
         return mean
-    low, high = (number(bound, digits) for bound in found["interval"])
+    low, high = (number(bound, digits) for bound in statistics["interval"])
     return mean if low == high else f"{mean} ({low}\N{EN DASH}{high})"
 
 
@@ -177,17 +179,17 @@ def evaluate_run(
         car = race_car_parts(run.experiment, config.evaluation, stored.networks.policy, evaluation)
     places = official_places(run.experiment, config.evaluation, evaluation)
     file = write_evaluation(run.path, evaluation, config.evaluation, stored, car, places)
-    known = trained_on(run.experiment, config.evaluation, evaluation)
-    out.print(results_table(evaluation, config.evaluation, known, out))
+    trained = trained_on(run.experiment, config.evaluation, evaluation)
+    out.print(results_table(evaluation, config.evaluation, trained, out))
     if car is not None:
         out.print()
         out.print(car_table(car))
         for line in explain_controls(run.experiment, config.evaluation):
             out.print(f"  {line}", soft_wrap=True, highlight=False)
-    for track, found in places.items():
-        laps = next(one for one in evaluation.groups if one.track == track and one.condition == USUAL)
+    for track, on_track in places.items():
+        laps = next(group for group in evaluation.groups if group.track == track and group.condition == USUAL)
         part = f"; {len(laps.lap_times_s)} of {len(laps.decided)} laps were complete" * (laps.lap_share < 1)
-        out.print(f"\n{found[0].words}{part}", soft_wrap=not out.is_terminal, highlight=False)
+        out.print(f"\n{on_track[0].words}{part}", soft_wrap=not out.is_terminal, highlight=False)
     out.print(
         f"\n  zig-zag  {evaluation.on(USUAL).zigzag.words()}, on straights", soft_wrap=True, highlight=False
     )
@@ -201,7 +203,7 @@ def evaluate_run(
         files[video] = FILMS
     tracking = run.experiment.tracking
     uri = config.tracking.uri or (tracking.uri if isinstance(tracking, MLflowTracking) else None)
-    metrics = _metrics(evaluation, known)
+    metrics = _metrics(evaluation, trained)
     runs_dir = run.path.resolve().parent.parent
     deliver_evaluation(run.path, uri, runs_dir, stored.counters["env_steps"], metrics, files)
     return evaluation
@@ -217,7 +219,7 @@ def official_places(
     if config.real_car is not None:
         return {}
     courses, observation = tracks_of(experiment, config), experiment.observation
-    found = {}
+    by_track = {}
     for group in evaluation.groups:
         course, mean_s = courses.get(group.track), group.mean_lap_time_s
         if group.condition != USUAL or course is None or mean_s is None:
@@ -233,8 +235,8 @@ def official_places(
             off_track_penalty_s=config.penalty_s.off_track if config.resets_per_lap else None,
         )
         if places:
-            found[group.track] = places
-    return found
+            by_track[group.track] = places
+    return by_track
 
 
 def trained_on(experiment: Experiment, config: EvaluationConfig, evaluation: Evaluation) -> list[str]:
@@ -249,18 +251,18 @@ def _metrics(evaluation: Evaluation, trained_on: Sequence[str]) -> dict[str, flo
     """Return the results as metrics of the run, suffixed with the track unless it is the run's only one."""
     names = evaluation.tracks
     labels = [None] if names == list(trained_on) and len(names) == 1 else track_labels(names)
-    found: dict[str, float | None] = {evaluate_metric("eval_race_score_s", None): evaluation.race_score_s}
+    metrics: dict[str, float | None] = {evaluate_metric("eval_race_score_s", None): evaluation.race_score_s}
     for group in evaluation.groups:
         label = labels[names.index(group.track)]
         if group.condition == USUAL:
-            found[evaluate_metric("eval_lap_time_s", label)] = group.mean_lap_time_s
-            found[evaluate_metric("eval_completion", label)] = group.completion
-            found |= {
+            metrics[evaluate_metric("eval_lap_time_s", label)] = group.mean_lap_time_s
+            metrics[evaluate_metric("eval_completion", label)] = group.completion
+            metrics |= {
                 evaluate_metric(column, label): value for column, value in zigzag_columns(group).items()
             }
         else:
-            found[evaluate_metric("held_out_completion", label)] = group.completion
-    return found
+            metrics[evaluate_metric("held_out_completion", label)] = group.completion
+    return metrics
 
 
 def car_protocols(config: EvaluationConfig) -> dict[str, EvaluationConfig]:
@@ -281,40 +283,42 @@ def race_car_parts(
     experiment: Experiment, config: EvaluationConfig, policy: torch.nn.Module, of_car: Evaluation
 ) -> dict[str, Evaluation]:
     """Race the policy in the plain simulator and with each part of the car alone; add `of_car`, with all parts."""
-    found = {name: Evaluator(experiment, one)(policy) for name, one in car_protocols(config).items()}
-    return {**found, CAR: of_car}
+    evaluations = {
+        name: Evaluator(experiment, protocol)(policy) for name, protocol in car_protocols(config).items()
+    }
+    return {**evaluations, CAR: of_car}
 
 
 def car_figures(evaluations: Mapping[str, Evaluation]) -> dict[str, dict[str, Any]]:
     """Return `lap_share`, `completion` (0 to 1) and `lap_time_s` (None on several tracks) of each, JSON types."""
-    found = {}
+    figures = {}
     for name, evaluation in evaluations.items():
         group = evaluation.on(USUAL)
-        found[name] = {
+        figures[name] = {
             "lap_share": group.lap_share,
             "completion": group.completion / 100,
             "lap_time_s": group.mean_lap_time_s if len(evaluation.tracks) == 1 else None,
         }
-    return found
+    return figures
 
 
 def car_table(evaluations: Mapping[str, Evaluation]) -> Table:
     """Return what is lost under usual conditions as a table: simulator, each part of the car alone, all of them."""
-    found = car_figures(evaluations)
-    base = found[SIMULATOR]
+    figures = car_figures(evaluations)
+    base = figures[SIMULATOR]
     shown = Table(box=None, pad_edge=False, title="from the simulator to the car", title_justify="left")
     for name in ("as on the car", "laps %", "lost %", "done %", "lap s", "lost s"):
         shown.add_column(name, justify="left" if name == "as on the car" else "right", no_wrap=True)
     shown.add_column("in sim2real against it")
     names = {SIMULATOR: "nothing", CAR: "all"}
-    for name, one in found.items():
-        lap_s, base_s = one["lap_time_s"], base["lap_time_s"]
+    for name, figure in figures.items():
+        lap_s, base_s = figure["lap_time_s"], base["lap_time_s"]
         lost_s = None if name == SIMULATOR or None in (lap_s, base_s) else lap_s - base_s
         shown.add_row(
             names.get(name, name),
-            f"{100 * one['lap_share']:.0f}",
-            NOTHING if name == SIMULATOR else f"{100 * (base['lap_share'] - one['lap_share']):.0f}",
-            f"{100 * one['completion']:.1f}",
+            f"{100 * figure['lap_share']:.0f}",
+            NOTHING if name == SIMULATOR else f"{100 * (base['lap_share'] - figure['lap_share']):.0f}",
+            f"{100 * figure['completion']:.1f}",
             number(lap_s, 2),
             NOTHING if lost_s is None else f"{lost_s:+.2f}",
             CURES.get(name, ""),

@@ -89,8 +89,8 @@ class Evaluator:
         if config.real_car is not None:
             require_car(experiment)
             setup = as_the_car(setup, config.real_car)
-        own = [conditions[trial.condition] for trial in self.trials]
-        self.race = Race(setup, len(self.trials), threads, randomizations=own)
+        of_trials = [conditions[trial.condition] for trial in self.trials]
+        self.race = Race(setup, len(self.trials), threads, randomizations=of_trials)
         self._course = np.array([trial.course for trial in self.trials])
         self._start_ndist = np.array([trial.start_ndist for trial in self.trials])
         self._closed = np.array([courses[trial.course].tracks[0].closed for trial in self.trials])
@@ -141,11 +141,11 @@ class Evaluator:
             TrialGroup(
                 track,
                 condition,
-                tuple(own),
-                tuple(a for a in protocol.attempts if a.trial in set(own)),
-                tuple(zigzags[trial] for trial in own),
+                tuple(trials),
+                tuple(a for a in protocol.attempts if a.trial in set(trials)),
+                tuple(zigzags[trial] for trial in trials),
             )
-            for (track, condition), own in rows.items()
+            for (track, condition), trials in rows.items()
         ]
 
     def _zigzag(self, course: int, rows: NDArray[np.float64]) -> "ZigZag":
@@ -198,9 +198,9 @@ def _conditions(key: str, option: str | None, experiment: Experiment) -> Randomi
 
 def _starts(config: EvaluationConfig, closed: bool, condition: str) -> NDArray[np.float64]:
     """Return the start of each trial as a share of the lap, (trials,)."""
-    at = np.arange(config.trials)
+    trial = np.arange(config.trials)
     if not closed:
         return np.zeros(config.trials)
     if config.starts is not None:
-        return np.array(config.starts)[at % len(config.starts)]
-    return (at + (0.5 if condition == HELD_OUT else 0.0)) / config.trials
+        return np.array(config.starts)[trial % len(config.starts)]
+    return (trial + (0.5 if condition == HELD_OUT else 0.0)) / config.trials

@@ -62,10 +62,10 @@ def in_frames(lap: Lap, control_hz: float) -> tuple[Lap, NDArray[np.intp]]:
 
     `control_hz` is how many steps the lap has in a second. Where the car was put back onto the track it does not drive.
     """
-    at = np.append(np.arange(0.0, len(lap) - 1, control_hz / FRAMES_PER_S), len(lap) - 1)
-    step = at.astype(np.intp)
+    time_steps = np.append(np.arange(0.0, len(lap) - 1, control_hz / FRAMES_PER_S), len(lap) - 1)
+    step = time_steps.astype(np.intp)
     after = np.minimum(step + 1, len(lap) - 1)
-    part = np.where(lap.time_s[after] - lap.time_s[step] > 1.5 / control_hz, 0.0, at - step)
+    part = np.where(lap.time_s[after] - lap.time_s[step] > 1.5 / control_hz, 0.0, time_steps - step)
 
     def between(values: NDArray[np.float64]) -> NDArray[np.float64]:
         return values[step] + part * (values[after] - values[step])
@@ -121,8 +121,8 @@ class LapRecorder:
             Numbers from 0, (n,); columns of the packed trace and the race clock, (n, columns + 1).
         """
         rows = np.array([step[attempt.trial] for step in self._steps])
-        own = np.flatnonzero(_within(attempt, np.r_[-1.0, rows[:-1, -1]], rows[:, -1]))
-        return own, rows[own]
+        lap_rows = np.flatnonzero(_within(attempt, np.r_[-1.0, rows[:-1, -1]], rows[:, -1]))
+        return lap_rows, rows[lap_rows]
 
     def lap(self, attempt: Attempt) -> Lap:
         """Return the poses of a lap."""
@@ -159,7 +159,9 @@ def best_attempt(evaluation: Evaluation, trials: Container[int] | None = None) -
 
     `trials` are those that count; None: all.
     """
-    attempts = [one for one in evaluation.on(USUAL).attempts if trials is None or one.trial in trials]
+    attempts = [
+        attempt for attempt in evaluation.on(USUAL).attempts if trials is None or attempt.trial in trials
+    ]
     return max(attempts, key=lambda a: (a.complete, -a.time_s if a.complete else a.progress))
 
 

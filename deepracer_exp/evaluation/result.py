@@ -106,7 +106,7 @@ class TrialGroup:
         decided = self.decided
         count = self._per_trial(decided, lambda _: 1.0)
         complete = self._per_trial(decided, lambda a: float(a.complete))
-        one = np.ones(len(self.trials))
+        once = np.ones(len(self.trials))
         return {
             "trials": len(self.trials),
             "laps_tried": len(decided),
@@ -119,15 +119,15 @@ class TrialGroup:
                 "best": _or_none(np.min, times),
                 "std": _or_none(np.std, times),
             },
-            "resets": _mean(self._per_trial(self.attempts, lambda a: float(a.resets)), one),
-            "penalty_s": _mean(self._per_trial(self.attempts, lambda a: a.penalty_s), one),
+            "resets": _mean(self._per_trial(self.attempts, lambda a: float(a.resets)), once),
+            "penalty_s": _mean(self._per_trial(self.attempts, lambda a: a.penalty_s), once),
             "race_score_s": self.race_score_s,
             "zigzag": self._zigzag_statistics(),
         }
 
     def _zigzag_statistics(self) -> dict[str, Any]:
         changes, straight_m = (
-            np.array([getattr(one, name) for one in self.zigzags], np.float64)
+            np.array([getattr(part, name) for part in self.zigzags], np.float64)
             for name in ("changes", "straight_m")
         )
         whole = self.zigzag
@@ -139,7 +139,7 @@ class TrialGroup:
         }
 
     def _per_trial(self, attempts: Sequence[Attempt], value: Any) -> NDArray[np.float64]:
-        place = {trial: at for at, trial in enumerate(self.trials)}
+        place = {trial: index for index, trial in enumerate(self.trials)}
         sums = np.zeros(len(self.trials))
         for attempt in attempts:
             sums[place[attempt.trial]] += value(attempt)
@@ -253,7 +253,7 @@ def _interval(sums: NDArray[np.float64], counts: NDArray[np.float64]) -> Interva
         return None
     from scipy.stats import bootstrap  # takes a second, and a training needs it only when it evaluates
 
-    found = bootstrap(
+    interval = bootstrap(
         (sums, counts),
         lambda s, c, axis: s.sum(axis=axis) / c.sum(axis=axis),
         paired=True,
@@ -264,7 +264,7 @@ def _interval(sums: NDArray[np.float64], counts: NDArray[np.float64]) -> Interva
         method="percentile",
         rng=np.random.default_rng(0),
     ).confidence_interval
-    return float(found.low), float(found.high)
+    return float(interval.low), float(interval.high)
 
 
 def _or_none(what: Any, values: NDArray[np.float64]) -> float | None:

@@ -55,16 +55,16 @@ def render_lap(lap: Lap, car: CarConfig) -> Iterator[NDArray[np.uint8]]:
     turned_rad = np.cumsum(lap.speed_mps) / FRAMES_PER_S / car.wheel_radius_m
     azimuth_rad = float(lap.yaw_rad[0])
     with mujoco.Renderer(model, HEIGHT, WIDTH) as renderer:
-        for at, yaw_rad in enumerate(lap.yaw_rad.tolist()):
-            data.qpos[place] = com_x_m[at] - car.com_x_m, com_y_m[at], yaw_rad
-            data.qpos[steer] = lap.steering_rad[at]
-            data.qpos[spin] = turned_rad[at]
+        for frame, yaw_rad in enumerate(lap.yaw_rad.tolist()):
+            data.qpos[place] = com_x_m[frame] - car.com_x_m, com_y_m[frame], yaw_rad
+            data.qpos[steer] = lap.steering_rad[frame]
+            data.qpos[spin] = turned_rad[frame]
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             mujoco.mj_camlight(model, data)
             azimuth_rad += _SMOOTHING * ((yaw_rad - azimuth_rad + np.pi) % (2 * np.pi) - np.pi)
             ahead = np.array([np.cos(azimuth_rad), np.sin(azimuth_rad)])
-            camera.lookat[:] = *(np.array([lap.x_m[at], lap.y_m[at]]) + 0.25 * ahead), 0.05
+            camera.lookat[:] = *(np.array([lap.x_m[frame], lap.y_m[frame]]) + 0.25 * ahead), 0.05
             camera.distance, camera.elevation = 1.3, -24.0
             camera.azimuth = np.degrees(azimuth_rad)
             renderer.update_scene(data, camera)
@@ -112,11 +112,11 @@ def write_video(file: Path, lap: Lap, car: CarConfig, err: Console) -> None:
         RunFailed: the file cannot be written.
     """
     shown, _ = in_frames(lap, car.control_hz)
-    frames = (_overlay(picture, shown, at) for at, picture in enumerate(render_lap(shown, car)))
+    frames = (_overlay(picture, shown, frame) for frame, picture in enumerate(render_lap(shown, car)))
     write_film(file, frames, len(shown), (WIDTH, HEIGHT), err)
 
 
-def _overlay(picture: NDArray[np.uint8], lap: Lap, at: int) -> NDArray[np.uint8]:
+def _overlay(picture: NDArray[np.uint8], lap: Lap, frame: int) -> NDArray[np.uint8]:
     """Draw lap time, speed and progress onto a frame."""
     image = Image.fromarray(picture).convert("RGBA")
     shade = Image.new("RGBA", image.size)
@@ -127,9 +127,9 @@ def _overlay(picture: NDArray[np.uint8], lap: Lap, at: int) -> NDArray[np.uint8]
     draw.text((30, 22), lap.title, font=small, fill=(235, 235, 235, 255))
     white = (255, 255, 255, 255)
     # Right-aligned, so that the numbers do not jump.
-    draw.text((150, 46), f"{lap.time_s[at]:.2f} s", font=large, fill=white, anchor="ra")
-    draw.text((right, 46), f"{max(lap.speed_mps[at], 0.0):.2f} m/s", font=large, fill=white, anchor="ra")
+    draw.text((150, 46), f"{lap.time_s[frame]:.2f} s", font=large, fill=white, anchor="ra")
+    draw.text((right, 46), f"{max(lap.speed_mps[frame], 0.0):.2f} m/s", font=large, fill=white, anchor="ra")
     draw.rectangle((30, 98, right, 108), fill=(255, 255, 255, 60))
-    draw.rectangle((30, 98, 30 + (right - 30) * lap.share(at), 108), fill=(245, 166, 35, 255))
+    draw.rectangle((30, 98, 30 + (right - 30) * lap.share(frame), 108), fill=(245, 166, 35, 255))
     framed: NDArray[np.uint8] = np.asarray(Image.alpha_composite(image, shade).convert("RGB"))
     return np.ascontiguousarray(framed)

@@ -137,13 +137,13 @@ class RewardFunction:
         Raises:
             RewardFailed: The function raised, timed out, or returned no finite number within +-`MAX_REWARD`.
         """
-        given = dict(params)
+        before = dict(params)
         try:
             return _as_reward(self.functions[0](params))
         except CtrlC:
             raise
         except BaseException as error:  # noqa: BLE001 - raised again as one of ours
-            self._fail(error, 0, given)
+            self._fail(error, 0, before)
 
     def _load(
         self, code: CodeType, name: str, prints: RewardPrints | None, car: int | None
@@ -182,8 +182,8 @@ class RewardFunction:
             raise
         except BaseException as error:  # noqa: BLE001 - raised again as one of ours
             # There is a reward for each car so far; the time limit may be exceeded right after the last one.
-            at = min(len(rewards), len(cars) - 1)
-            self._fail(error, cars[at], scalar_params(table[at], own_params[at]))
+            failed = min(len(rewards), len(cars) - 1)
+            self._fail(error, cars[failed], scalar_params(table[failed], own_params[failed]))
         return rewards
 
     def _call_batch(
@@ -205,15 +205,15 @@ class RewardFunction:
             place = track_of[first]
             return batch_params(part, track_params[place], self._waypoints[place])
 
-        at = (0, len(cars))
+        ends = (0, len(cars))
         try:
             with Guard(self.time_limit_s):
-                for at in itertools.pairwise(bounds):
-                    rewards[slice(*at)] = _as_rewards(self.functions[0](params(*at)), at[1] - at[0])
+                for ends in itertools.pairwise(bounds):
+                    rewards[slice(*ends)] = _as_rewards(self.functions[0](params(*ends)), ends[1] - ends[0])
         except CtrlC:
             raise
         except BaseException as error:  # noqa: BLE001 - raised again as one of ours
-            self._fail(error, None, params(*at))
+            self._fail(error, None, params(*ends))
         bad = np.flatnonzero(~(np.abs(rewards) <= MAX_REWARD))
         if len(bad):
             row, road = list(rows(selected))[bad[0]], track_params[track_of[bad[0]]]

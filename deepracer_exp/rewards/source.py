@@ -62,8 +62,10 @@ def load_reward_source(config: RewardConfig) -> RewardSource:
     constants = {constant: ast.literal_eval(value) for constant, value in _constants(tree)}
     for key in config.constants:
         if key not in constants:
-            known = ", ".join(constants) or "none; a constant is a line NAME = number with NAME in capitals"
-            why = f"{path} has no such constant{nearest(key.upper(), constants)}: {known}"
+            accepted = (
+                ", ".join(constants) or "none; a constant is a line NAME = number with NAME in capitals"
+            )
+            why = f"{path} has no such constant{nearest(key.upper(), constants)}: {accepted}"
             raise Unknown(f"reward.constants.{key}", why)
     overrides = {key: _like(constants[key], value) for key, value in config.constants.items()}
     return RewardSource(name, path, text, hashlib.sha256(data).hexdigest(), constants, overrides)
@@ -83,13 +85,13 @@ def named_reward_source(reward: str) -> RewardSource:
 def source_with_constants(source: RewardSource) -> str:
     """Return the module's text with the overriding values in place; everything else is unchanged."""
     lines = source.text.encode().split(b"\n")
-    found = [
+    replaced = [
         (value, source.overrides[name])
         for name, value in _constants(ast.parse(source.text))
         if name in source.overrides
     ]
     # From the last to the first, so that earlier positions stay valid.
-    for node, value in reversed(found):
+    for node, value in reversed(replaced):
         assert node.end_lineno is not None
         assert node.end_col_offset is not None
         first, last = node.lineno - 1, node.end_lineno - 1
@@ -101,10 +103,10 @@ def source_with_constants(source: RewardSource) -> str:
 def is_of_zoo(text: str) -> bool:
     """Return whether a module is one of the reward zoo, up to the values of its constants; nothing is run."""
     try:
-        asked = _without_values("reward function", text)
+        plain = _without_values("reward function", text)
     except BadInput:
         return False
-    return any(asked == _without_values(name, _decode(*_zoo_file(name))) for name in zoo_names())
+    return any(plain == _without_values(name, _decode(*_zoo_file(name))) for name in zoo_names())
 
 
 def _without_values(path: str, text: str) -> str:
@@ -113,10 +115,10 @@ def _without_values(path: str, text: str) -> str:
 
 
 def _zoo_file(name: str) -> tuple[str, bytes]:
-    known = zoo_names()
-    if name not in known:
+    names = zoo_names()
+    if name not in names:
         raise BadInput(
-            "reward.name", f"{name!r} is not in the reward zoo{nearest(name, known)}: {', '.join(known)}"
+            "reward.name", f"{name!r} is not in the reward zoo{nearest(name, names)}: {', '.join(names)}"
         )
     file = project_dir(_ZOO) / f"{name}.py"
     return str(file), file.read_bytes()

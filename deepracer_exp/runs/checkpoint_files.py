@@ -30,11 +30,11 @@ def verify(folder: Path) -> None:
     """
     try:
         wanted = dict(json.loads((folder / HASHES).read_text(encoding="utf-8")))
-        found = {path: _sha256(folder / path) for path in _files(folder)}
+        hashes = {path: _sha256(folder / path) for path in _files(folder)}
     except (OSError, ValueError, TypeError) as error:
         raise BadInput(folder, f"corrupt: {HASHES} cannot be used: {error}") from error
-    if found != wanted:
-        changed = sorted(set(found.items()) ^ set(wanted.items()))
+    if hashes != wanted:
+        changed = sorted(set(hashes.items()) ^ set(wanted.items()))
         raise BadInput(folder, f"corrupt: {changed[0][0]} is not as it was written")
 
 
@@ -81,10 +81,10 @@ def find_checkpoint(folder: Path, name: str) -> Path:
     path = folder / (f"{int(name):06d}" if name.isdecimal() else name)
     kept = kept_checkpoints(folder)
     if not (path.exists() or path.is_symlink() or (name == "last" and kept)):
-        known = ", ".join(
+        accepted = ", ".join(
             [*(link for link in LINKS if (folder / link).is_symlink()), *(p.name for p in kept)]
         )
-        raise BadInput(f"checkpoint={name}", f"{path} is not there; checkpoints: {known or 'none'}")
+        raise BadInput(f"checkpoint={name}", f"{path} is not there; checkpoints: {accepted or 'none'}")
     if path.exists() and path.resolve().parent != folder.resolve():
         raise BadInput(
             f"checkpoint={name}", f"{path} leads out of its folder to {path.resolve()}; give a number"
@@ -96,10 +96,10 @@ def kept_checkpoints(folder: Path) -> list[Path]:
     """Return the checkpoints of a run, not the links to them, newest first."""
     if not folder.is_dir():
         return []
-    own = [path for path in folder.iterdir() if path.is_dir() and not path.is_symlink()]
+    folders = [path for path in folder.iterdir() if path.is_dir() and not path.is_symlink()]
     # `best` is a real folder in a copy that cannot be written, see `restore_links`.
-    known = [path for path in own if path.name.isdecimal() or path.name in LINKS]
-    return sorted(known, key=lambda path: int(path.name) if path.name.isdecimal() else -1, reverse=True)
+    named = [path for path in folders if path.name.isdecimal() or path.name in LINKS]
+    return sorted(named, key=lambda path: int(path.name) if path.name.isdecimal() else -1, reverse=True)
 
 
 def checkpoint_sha256(folder: Path) -> str:
@@ -137,8 +137,8 @@ def pinned(checkpoints: Path) -> dict[str, list[str]]:
 
 
 def _files(folder: Path) -> list[str]:
-    found = (path for path in folder.rglob("*") if path.is_file())
-    return sorted(path.relative_to(folder).as_posix() for path in found if path != folder / HASHES)
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return sorted(path.relative_to(folder).as_posix() for path in files if path != folder / HASHES)
 
 
 def _sha256(file: Path) -> str:

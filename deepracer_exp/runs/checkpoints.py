@@ -80,7 +80,7 @@ def intact_checkpoint(folder: Path, name: str, *, resumable: bool = False) -> Pa
         if candidate is not path and path.exists() and candidate.samefile(path):
             continue
         try:
-            found = check(candidate, resumable=resumable)
+            fault = check(candidate, resumable=resumable)
         except BadInput as error:
             if name.isdecimal():
                 raise
@@ -88,8 +88,8 @@ def intact_checkpoint(folder: Path, name: str, *, resumable: bool = False) -> Pa
             continue
         if reasons:
             why = "; ".join(reasons)
-            logger.warning("checkpoint=%s: %s; using %s, the newest intact one", name, why, found.name)
-        return found
+            logger.warning("checkpoint=%s: %s; using %s, the newest intact one", name, why, fault.name)
+        return fault
     raise BadInput(f"checkpoint={name}", f"{'; '.join(reasons[:3])}; no checkpoint in {folder} is intact")
 
 
@@ -298,7 +298,7 @@ class CheckpointStore:
         `best` is the iteration of the best checkpoint up to there, None if there was none.
         """
         pins = pinned(self.folder)
-        for path in self._own():
+        for path in self._numbered():
             if int(path.name) > iteration and path.name not in pins:
                 _remove(path)
         for label, number in (("last", iteration), ("best", best)):
@@ -333,19 +333,19 @@ class CheckpointStore:
         aside.replace(self.folder / label)
 
     def _prune(self) -> None:
-        own = self._own()
+        numbered = self._numbered()
         kept = {str(path.readlink()) for path in self.folder.iterdir() if path.is_symlink()}
         # That of the start is of no use once there is another.
-        evaluated = [path.name for path in own if int(path.name) and int(path.name) % self._every == 0]
+        evaluated = [path.name for path in numbered if int(path.name) and int(path.name) % self._every == 0]
         kept |= {*evaluated[-self._keep :]} | pinned(self.folder).keys()
-        for path in own:
+        for path in numbered:
             if path.name not in kept:
                 _remove(path)
 
-    def _own(self) -> list[Path]:
+    def _numbered(self) -> list[Path]:
         """Return the checkpoints, the oldest first."""
-        found = (path for path in self.folder.iterdir() if path.name.isdigit() and path.is_dir())
-        return sorted(found, key=lambda path: int(path.name))
+        folders = (path for path in self.folder.iterdir() if path.name.isdigit() and path.is_dir())
+        return sorted(folders, key=lambda path: int(path.name))
 
 
 def checkpoint_name(iteration: int) -> str:

@@ -83,16 +83,16 @@ def survey(runs_dir: Path, overview: StoreOverview | None) -> Removables:
     Raises:
         BadInput: a file that says what must be kept cannot be read.
     """
-    found = Removables()
+    removables = Removables()
     try:
         wanted = _cloned_from(runs_dir)
         for folder, name in () if overview is None else sorted(overview.registered):
             wanted[folder].setdefault(name, "registered")
         for run in _own_runs(runs_dir):
-            _search(run, wanted[run.name], overview, found)
+            _search(run, wanted[run.name], overview, removables)
     except OSError as error:
         raise BadInput(error.filename, f"cannot be read: {error.strerror}; nothing is removed") from error
-    return found
+    return removables
 
 
 def remove(item: Removable) -> bool:
@@ -126,37 +126,39 @@ def total_bytes(items: Sequence[Removable]) -> int:
     return sum(item.size for item in items)
 
 
-def _search(run: Path, wanted: dict[str, str], overview: StoreOverview | None, found: Removables) -> None:
+def _search(
+    run: Path, wanted: dict[str, str], overview: StoreOverview | None, removables: Removables
+) -> None:
     if reason := _in_progress(run):
-        found.kept.append((run, reason))
+        removables.kept.append((run, reason))
         return
     run_id = read_run_id(run)
     pins = wanted | {name: ", ".join(reasons) for name, reasons in pinned(run / CHECKPOINTS).items()}
     if overview is not None and run_id is not None and overview.deleted.get(run_id):
         if not pins:
-            found.removable.append(Removable(run, DELETED, (run,), _size(run)))
+            removables.removable.append(Removable(run, DELETED, (run,), _size(run)))
             return
         reasons = ", ".join(f"{name} {why}" for name, why in sorted(pins.items()))
-        found.kept.append((run, f"deleted in MLflow, but needed: {reasons}"))
+        removables.kept.append((run, f"deleted in MLflow, but needed: {reasons}"))
     spare = _spare_checkpoints(run, set(pins))
     is_known = run_id is None or (overview is not None and run_id in overview.deleted)
     if spare and not is_known:
-        found.kept.append((run, _UNKNOWN))
+        removables.kept.append((run, _UNKNOWN))
     elif spare:
         try:
             verify(run / CHECKPOINTS / "last")
         except BadInput as error:
-            found.kept.append((run, f"its other checkpoints may be needed: {error}"))
+            removables.kept.append((run, f"its other checkpoints may be needed: {error}"))
         else:
-            found.removable.append(Removable(run, SPARE_CHECKPOINTS, spare, sum(map(_size, spare))))
+            removables.removable.append(Removable(run, SPARE_CHECKPOINTS, spare, sum(map(_size, spare))))
     trace = run / TRACE
     status = read_object(run / SUMMARY).get("status")
     if status is None or not _is_folder(trace):
         return
     if status == FAILED:
-        found.removable.append(Removable(run, FAILED_TRACE, (trace,), _size(trace)))
+        removables.removable.append(Removable(run, FAILED_TRACE, (trace,), _size(trace)))
     elif status in (FINISHED, STOPPED_EARLY):
-        found.offered.append(Removable(run, WHOLE_TRACE, (trace,), _size(trace)))
+        removables.offered.append(Removable(run, WHOLE_TRACE, (trace,), _size(trace)))
 
 
 def asked_traces(offered: Sequence[Removable], how: str | None) -> list[Removable]:
@@ -242,5 +244,5 @@ def _is_folder(path: Path) -> bool:
 
 def _size(folder: Path) -> int:
     """Return the bytes of all files below, without following links."""
-    files = (Path(at, name) for at, _, names in os.walk(folder) for name in names)
+    files = (Path(below, name) for below, _, names in os.walk(folder) for name in names)
     return sum(file.lstat().st_size for file in files)

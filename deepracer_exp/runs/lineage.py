@@ -82,7 +82,9 @@ def refuse_other_networks(parent: Experiment, clone: Experiment) -> None:
             "observation",
             f"cannot be changed in a clone: {len(theirs)} -> {len(ours)} features ({odd}); {why}",
         )
-    acted, acts = (describe_actions(build_action_space(one.action_space)) for one in (parent, clone))
+    acted, acts = (
+        describe_actions(build_action_space(experiment.action_space)) for experiment in (parent, clone)
+    )
     if acted != acts:
         raise BadInput("action_space", f"cannot be changed in a clone: {acted} -> {acts}; {why}")
 
@@ -153,9 +155,9 @@ def best_members(root: FamilyMember) -> dict[int, str]:
 
     Where a run was evaluated, those that were not are out.
     """
-    known = [(one, one.result) for one in root.walk() if one.result is not None]
-    known = [pair for pair in known if pair[1].evaluated] or known
-    groups = _best_of_groups((member.course, member, result) for member, result in known)
+    rated = [(relative, relative.result) for relative in root.walk() if relative.result is not None]
+    rated = [pair for pair in rated if pair[1].evaluated] or rated
+    groups = _best_of_groups((member.course, member, result) for member, result in rated)
     several = len({course for course, _ in groups}) > 1
     words: dict[int, str] = {}
     for (course, _), (member, result) in groups.items():
@@ -166,9 +168,13 @@ def best_members(root: FamilyMember) -> dict[int, str]:
 
 def best_by_generation(root: FamilyMember) -> list[tuple[int, FamilyMember, RunResult]]:
     """Return the best member of each generation on each track and measure; evaluated ones before others."""
-    known = [((one.generation, one.course), one, one.result) for one in root.walk() if one.result is not None]
-    evaluated = {place for place, _, result in known if result.evaluated}
-    groups = _best_of_groups(one for one in known if one[2].evaluated or one[0] not in evaluated)
+    rated = [
+        ((member.generation, member.course), member, member.result)
+        for member in root.walk()
+        if member.result is not None
+    ]
+    evaluated = {place for place, _, result in rated if result.evaluated}
+    groups = _best_of_groups(entry for entry in rated if entry[2].evaluated or entry[0] not in evaluated)
     return [(place[0], *groups[place, measure]) for place, measure in sorted(groups)]
 
 
@@ -176,12 +182,12 @@ def _best_of_groups(
     members: Iterable[tuple[_Place, FamilyMember, RunResult]],
 ) -> dict[tuple[_Place, str], tuple[FamilyMember, RunResult]]:
     """Return the best by place and measure, the first of equals."""
-    found: dict[tuple[_Place, str], tuple[FamilyMember, RunResult]] = {}
+    best: dict[tuple[_Place, str], tuple[FamilyMember, RunResult]] = {}
     for place, member, result in members:
         key = place, result.measure
-        if key not in found or result.rank > found[key][1].rank:
-            found[key] = member, result
-    return found
+        if key not in best or result.rank > best[key][1].rank:
+            best[key] = member, result
+    return best
 
 
 def _parent(lineage: Lineage, places: list[Path]) -> Path:
@@ -206,8 +212,8 @@ def _grow(
         generation = min(child.generation for child in below) - 1
     for child in below:
         if record is not None and child.record is not None:
-            found = run_differences([record, child.record])
-            child.changes = {key: (a, b) for key, (a, b) in found.items() if key not in _IGNORED}
+            differences = run_differences([record, child.record])
+            child.changes = {key: (a, b) for key, (a, b) in differences.items() if key not in _IGNORED}
     result = None if record is None else read_result(root)
     return FamilyMember(root.name, root, record, lineage, generation, result, below)
 
@@ -233,5 +239,5 @@ def run_differences(records: Sequence[RunRecord]) -> dict[str, list[Any]]:
 
 def course_names(track: Any) -> str:
     """Return the name of the track of a configuration, or those of several."""
-    known = isinstance(track, Mapping)
-    return str(track["name"]) if known and "name" in track else ", ".join(track) if known else ABSENT
+    is_single = isinstance(track, Mapping)
+    return str(track["name"]) if is_single and "name" in track else ", ".join(track) if is_single else ABSENT

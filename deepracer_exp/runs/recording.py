@@ -131,10 +131,10 @@ def read_run_recording(folder: Path) -> RunRecording:
 
 def _steps(folder: Path, problems: list[LogProblem], files: list[Path]) -> pd.DataFrame:
     """Read the newest files of the trace that together have no more than `MOST_STEPS` rows."""
-    found = trace_files(folder / TRACE)
+    traces = trace_files(folder / TRACE)
     tables: dict[Path, pa.Table] = {}
     rows = left_out = 0
-    for path in reversed(found):
+    for path in reversed(traces):
         try:
             count = pq.read_metadata(path).num_rows
             rows += count
@@ -211,23 +211,25 @@ def _metrics(
 def _decision(folder: Path) -> Mapping[str, Any] | None:
     """Return what the run's stopping rule decided, None if it did not or that cannot be read."""
     try:
-        found = read_object(folder / SUMMARY).get("stopping")
+        decision = read_object(folder / SUMMARY).get("stopping")
     except BadInput:  # `_best` reports it
         return None
     return (
-        found if isinstance(found, dict) and {"rule", "why", "values", "thresholds"} <= found.keys() else None
+        decision
+        if isinstance(decision, dict) and {"rule", "why", "values", "thresholds"} <= decision.keys()
+        else None
     )
 
 
 def _best(folder: Path, problems: list[LogProblem]) -> RunResult:
     """Return what the run's summary says of its best checkpoint."""
     try:
-        found = read_result(folder)
+        result = read_result(folder)
     except BadInput as error:
         file = folder / SUMMARY
         problems.append(LogProblem(str(file), None, error.without(file)))
-        found = None
-    return found or RunResult(measure=IN_TRAINING, rank=(0.0, -math.inf), completion=None, lap_time_s=None)
+        result = None
+    return result or RunResult(measure=IN_TRAINING, rank=(0.0, -math.inf), completion=None, lap_time_s=None)
 
 
 def _number(value: Any) -> float:
@@ -247,11 +249,11 @@ def _metadata(folder: Path, config: Mapping[str, Any], problems: list[LogProblem
 
 def _hyperparameters(config: Mapping[str, Any]) -> dict[str, Any] | None:
     """Return the hyperparameters that the service has, too, by its names."""
-    own = config.get("algorithm")
-    if not isinstance(own, Mapping):
+    algorithm = config.get("algorithm")
+    if not isinstance(algorithm, Mapping):
         return None
     keys = {word: key.removeprefix("algorithm.") for word, key in TAKEN.items()}
-    return {word: own[key] for word, key in keys.items() if own.get(key) is not None}
+    return {word: algorithm[key] for word, key in keys.items() if algorithm.get(key) is not None}
 
 
 def _track(config: Mapping[str, Any]) -> str | None:

@@ -110,13 +110,15 @@ class RunResult:
     def words(self) -> str:
         """Return the figures that are known: ``mean usual lap 7.97 s, usual completion 100.0%``."""
         if not self.evaluated:
-            known = [
+            figures = [
                 ("exploring completion, %", self.completion, "{:.1f}"),
                 ("fastest exploring lap, s", self.lap_time_s, "{:.2f}"),
             ]
         else:
-            known = [(self.figure(name), getattr(self, key), form) for name, key, form, _ in FIGURES]
-        parts = [(*name.split(", "), form.format(value)) for name, value, form in known if value is not None]
+            figures = [(self.figure(name), getattr(self, key), form) for name, key, form, _ in FIGURES]
+        parts = [
+            (*name.split(", "), form.format(value)) for name, value, form in figures if value is not None
+        ]
         text = ", ".join(f"{name} {with_unit(value, unit)}" for name, unit, value in parts)
         if self.lap_time_s is None:
             text += ", no complete lap"

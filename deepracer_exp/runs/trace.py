@@ -62,10 +62,10 @@ def trace_files(folder: Path) -> list[Path]:
     Raises:
         BadInput: there is none.
     """
-    found = sorted(path for path in folder.glob(f"*{_ENDING}") if not path.name.startswith("."))
-    if not found:
+    files = sorted(path for path in folder.glob(f"*{_ENDING}") if not path.name.startswith("."))
+    if not files:
         raise BadInput(folder, f"no *{_ENDING}", "the folder of a run with its trace")
-    return found
+    return files
 
 
 def rewind_trace(folder: Path, iteration: int) -> None:

@@ -209,8 +209,11 @@ def _take_boxes(poses, boxes, corners, mounts, out):  # type: ignore[no-untyped-
                 beyond_left += focal * across < -middle_x * depth
                 beyond_right += focal * across > middle_x * depth
                 behind += depth <= NEAREST_M
-                at = middle_x + focal * across / max(depth, NEAREST_M)
-                columns[box, 0], columns[box, 1] = min(columns[box, 0], at), max(columns[box, 1], at)
+                projected = middle_x + focal * across / max(depth, NEAREST_M)
+                columns[box, 0], columns[box, 1] = (
+                    min(columns[box, 0], projected),
+                    max(columns[box, 1], projected),
+                )
             if beyond_left == 8 or beyond_right == 8 or behind == 8:
                 continue
             if behind:
@@ -281,9 +284,9 @@ def _take_boxes(poses, boxes, corners, mounts, out):  # type: ignore[no-untyped-
             running[:] = 0
             for row in range(first_row, last_row):
                 for column in range(first_column, last_column):
-                    at = row * width + column
+                    projected = row * width + column
                     for channel in range(channels + 1):
-                        running[channel, column] += changes[channel, at]
+                        running[channel, column] += changes[channel, projected]
                     behind_it = 1 - min(max(running[channels, column], np.float32(0)), np.float32(1))
                     for channel in range(channels):
                         value = behind_it * out[car, channel, row, column] + running[channel, column]
@@ -380,12 +383,12 @@ def _add_flat(changes, height, width, ax, ay, bx, slope, sign, change):  # type:
         mean = 0.5 * (high - low)
         first = in_first - mean if low + in_first >= high else 0.25 * in_first * in_first / mean
         both = in_first + 1.0 - mean
-        at = np.uint64(row * width + column)
+        pixel = np.uint64(row * width + column)
         for channel in range(len(change)):
             step = np.float32(weight) * change[channel]
-            changes[channel, at] += np.float32(first) * step
-            changes[channel, at + np.uint64(width)] += np.float32(both - 2.0 * first) * step
-            changes[channel, at + np.uint64(2 * width)] += np.float32(1.0 - both + first) * step
+            changes[channel, pixel] += np.float32(first) * step
+            changes[channel, pixel + np.uint64(width)] += np.float32(both - 2.0 * first) * step
+            changes[channel, pixel + np.uint64(2 * width)] += np.float32(1.0 - both + first) * step
 
 
 @njit(cache=True, fastmath=True, error_model="numpy", inline="always")
@@ -408,11 +411,11 @@ def _add_steep(changes, width, ax, ay, by, x_per_row, sign, change):  # type: ig
             wide = border - left if part == 0 else right - border
             middle = 0.5 * (left + border) if part == 0 else 0.5 * (border + right)
             below = at_left - (middle - left) * per_x
-            at = np.uint64(row * width + min(column + part, width - 1))
+            pixel = np.uint64(row * width + min(column + part, width - 1))
             for channel in range(len(change)):
                 step = np.float32(sign * wide) * change[channel]
-                changes[channel, at] += np.float32(below) * step
-                changes[channel, at + np.uint64(width)] += np.float32(1.0 - below) * step
+                changes[channel, pixel] += np.float32(below) * step
+                changes[channel, pixel + np.uint64(width)] += np.float32(1.0 - below) * step
 
 
 @njit(cache=True, fastmath=True, error_model="numpy", inline="always")

@@ -177,14 +177,14 @@ def box_corners(boxes: NDArray[np.floating]) -> NDArray[np.floating]:
 
 def join_sceneries(sceneries: Sequence[Scenery]) -> Scenery:
     """Return several tracks' outlines as one; the index of a track is its index in the argument."""
-    points = np.cumsum([0, *(len(one.points_m) for one in sceneries)])
-    pieces = [one.pieces.copy() for one in sceneries]
-    for some, at in zip(pieces, points, strict=False):
-        some["first"] += at
-        some["last"] += at
+    points = np.cumsum([0, *(len(scenery.points_m) for scenery in sceneries)])
+    pieces = [scenery.pieces.copy() for scenery in sceneries]
+    for some, first in zip(pieces, points, strict=False):
+        some["first"] += first
+        some["last"] += first
     return Scenery(
-        np.concatenate([one.points_m for one in sceneries]),
-        np.concatenate([one.joined for one in sceneries]),
+        np.concatenate([scenery.points_m for scenery in sceneries]),
+        np.concatenate([scenery.joined for scenery in sceneries]),
         np.concatenate(pieces),
         np.cumsum([0, *(len(some) for some in pieces)]),
     )

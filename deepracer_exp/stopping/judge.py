@@ -77,7 +77,7 @@ def convergence(
     judge = TrendRule(_only(converged=rule), action_count)
     ends = [judge.observe(row) is not None for row in _rows(table)]
     completion = judge.averages["completion"]
-    if not completion.known(rule.patience):
+    if not completion.reaches_back(rule.patience):
         return None
     going = len(ends) - (ends[::-1].index(False) if False in ends else len(ends))
     before, _ = completion.bests(rule.patience)
@@ -117,8 +117,8 @@ def overfitting(iterations: "pd.DataFrame", stopping: Mapping[str, Any] | None =
         iterations: a row each, with the columns of `convergence`, `held_out_completion` and `eval_completion`.
         stopping: of a run of ours, its group `stopping`, whose rule is applied if it has one; None: LOG_OVERFITTING.
     """
-    own = _entropy_stopping(stopping)
-    rule = (own and own.overfitting) or LOG_OVERFITTING
+    run_rule = _entropy_stopping(stopping)
+    rule = (run_rule and run_rule.overfitting) or LOG_OVERFITTING
     for column, name in (("held_out_completion", "held-out evaluation"), ("eval_completion", "evaluation")):
         if iterations[column].notna().sum() < _FEWEST_EVALUATIONS:
             continue
@@ -139,8 +139,8 @@ def overfitting(iterations: "pd.DataFrame", stopping: Mapping[str, Any] | None =
 
 def convergence_rule(stopping: Mapping[str, Any] | None) -> ConvergedRule:
     """Return the rule of convergence of a group `stopping`, LOG_RULE if it has none."""
-    own = _entropy_stopping(stopping)
-    return (own and own.converged) or LOG_RULE
+    rule = _entropy_stopping(stopping)
+    return (rule and rule.converged) or LOG_RULE
 
 
 def _only(

@@ -101,22 +101,23 @@ def table(replays: Sequence[Replay]) -> Table:
         grid.add_column(name, overflow="fold")
     for name in ("ends after", "steps", "saved", "completion", "fastest lap", "lap lost"):
         grid.add_column(name, justify="right", no_wrap=True)
-    for one in replays:
+    for replayed in replays:
         grid.add_row(
-            one.run,
-            f"{one.rule}\n{one.decision or 'continues to the end'}",
-            f"{one.iteration} of {one.iterations}",
-            f"{one.env_steps:,}",
-            f"{one.saved:.0%}, {one.saved_s:.0f} s" if one.decision else _NOTHING,
-            _of(one.completion, one.completion_whole, "{:.1f}", "%"),
-            _of(one.lap_time_s, one.lap_time_whole_s, "{:.2f}", "s") + " exploring" * (not one.evaluated),
-            _NOTHING if one.lap_loss is None else f"{one.lap_loss:.1%}",
+            replayed.run,
+            f"{replayed.rule}\n{replayed.decision or 'continues to the end'}",
+            f"{replayed.iteration} of {replayed.iterations}",
+            f"{replayed.env_steps:,}",
+            f"{replayed.saved:.0%}, {replayed.saved_s:.0f} s" if replayed.decision else _NOTHING,
+            _of(replayed.completion, replayed.completion_whole, "{:.1f}", "%"),
+            _of(replayed.lap_time_s, replayed.lap_time_whole_s, "{:.2f}", "s")
+            + " exploring" * (not replayed.evaluated),
+            _NOTHING if replayed.lap_loss is None else f"{replayed.lap_loss:.1%}",
         )
-    for rule in dict.fromkeys(one.rule for one in replays):
-        of_rule = [one for one in replays if one.rule == rule]
-        losses = [one.lap_loss for one in of_rule if one.lap_loss is not None]
+    for rule in dict.fromkeys(replayed.rule for replayed in replays):
+        of_rule = [replayed for replayed in replays if replayed.rule == rule]
+        losses = [replayed.lap_loss for replayed in of_rule if replayed.lap_loss is not None]
         if len(of_rule) > 1:
-            saved = f"{sum(one.saved for one in of_rule) / len(of_rule):.0%}"
+            saved = f"{sum(replayed.saved for replayed in of_rule) / len(of_rule):.0%}"
             lost = f"{sum(losses) / len(losses):.1%}" if losses else _NOTHING
             grid.add_row("mean", rule, "", "", saved, "", "", lost)
     return grid
@@ -139,11 +140,11 @@ def _observed(stopping: StoppingRule, row: Row, record: RunRecord, number: int) 
 
 def _check_episodes(record: RunRecord, config: ReliableStopping) -> None:
     """Refuse another number of episodes than the run's lap_share was taken over."""
-    own = record.config.get("stopping", {}).get("episodes", REMEMBERED_EPISODES)
-    if own != config.episodes:
+    remembered = record.config.get("stopping", {}).get("episodes", REMEMBERED_EPISODES)
+    if remembered != config.episodes:
         raise BadInput(
-            f"stopping.episodes={config.episodes}: {record.name} recorded the share of its last {own} episodes; "
-            f"accepted: {own}"
+            f"stopping.episodes={config.episodes}: {record.name} recorded the share of its last {remembered} episodes; "
+            f"accepted: {remembered}"
         )
 
 
@@ -163,8 +164,8 @@ def action_count(record: RunRecord) -> int | None:
 
 def _ended_with(rows: Sequence[Row]) -> float | None:
     """Return the mean completion of the last ten iterations, because single ones vary."""
-    known = [row["completion"] for row in rows[-10:] if row["completion"] is not None]
-    return sum(known) / len(known) if known else None
+    completions = [row["completion"] for row in rows[-10:] if row["completion"] is not None]
+    return sum(completions) / len(completions) if completions else None
 
 
 def _is_evaluated(rows: Sequence[Row]) -> bool:
@@ -177,5 +178,5 @@ def _fastest(rows: Sequence[Row], every: Sequence[Row]) -> float | None:
         columns = ["eval_lap_time_s"]
     else:
         columns = [key for key in every[-1] if key.startswith("best_lap_time_s/")] or ["best_lap_time_s"]
-    known = [[row[key] for row in rows if row.get(key) is not None] for key in columns]
-    return sum(map(min, known)) / len(known) if all(known) else None
+    times_s = [[row[key] for row in rows if row.get(key) is not None] for key in columns]
+    return sum(map(min, times_s)) / len(times_s) if all(times_s) else None

@@ -166,7 +166,7 @@ class TrendRule(StoppingRule):
 
     def _plateau(self, config: PlateauStopping) -> Decision | None:
         series = self.averages[config.metric]
-        if self._rows <= max(config.warmup, config.patience) or not series.known(config.patience):
+        if self._rows <= max(config.warmup, config.patience) or not series.reaches_back(config.patience):
             return None
         before, since = series.bests(config.patience)
         if since > before + config.gain * series.range:
@@ -188,7 +188,7 @@ class TrendRule(StoppingRule):
             if rule is None or self._rows <= max(rule.warmup, rule.patience):
                 continue
             averages = [self.averages[column] for column in columns]
-            if all(average.known(rule.patience) for average in averages) and (
+            if all(average.reaches_back(rule.patience) for average in averages) and (
                 reason := judge(rule, *averages)
             ):
                 return _decision(name, *reason, rule)

@@ -31,7 +31,7 @@ class Average:
             self.best, self._worst = max(self.best, average), min(self._worst, average)
         self._averages.append(average)
 
-    def known(self, patience: int) -> bool:
+    def reaches_back(self, patience: int) -> bool:
         """Return whether there is an average before the last `patience` rows."""
         return len(self._averages) > patience and self._averages[-patience - 1] is not None
 
@@ -56,7 +56,7 @@ class Average:
 
     def change(self, patience: int) -> float | None:
         """Return the range of the averages in the last `patience` rows, None where there is none before them."""
-        if not self.known(patience):
+        if not self.reaches_back(patience):
             return None
         last = self.last(patience)
         return max(last) - min(last)

@@ -41,10 +41,10 @@ class BoundedClient:
         self._end_by = None if total_s is None else time.monotonic() + total_s
 
     def __getattr__(self, name: str) -> Any:
-        found = getattr(self._client, name)
-        if not callable(found):
-            return found
-        return partial(self._call, found)
+        attribute = getattr(self._client, name)
+        if not callable(attribute):
+            return attribute
+        return partial(self._call, attribute)
 
     def _call(self, call: Callable[..., Any], *args: Any, **options: Any) -> Any:
         left_s = CALL_S if self._end_by is None else max(self._end_by - time.monotonic(), 0.0)
@@ -110,10 +110,10 @@ def _sentence(error: BaseException) -> str:
     failed = re.search(r"too many (\d{3}) error responses|failed with error code (\d{3})", text)
     status = int(failed[1] or failed[2]) if failed else None
     if any(
-        isinstance(one, NewConnectionError | ProtocolError) for one in links
+        isinstance(link, NewConnectionError | ProtocolError) for link in links
     ):  # the first is a TimeoutError, too
         return "no connection: nothing answers at this address"
-    if any(isinstance(one, TooLate) for one in links):
+    if any(isinstance(link, TooLate) for link in links):
         return f"no answer within {MLFLOW_HTTP_REQUEST_TIMEOUT.get()} s"
     if isinstance(error, MlflowException) and error.error_code == "UNAUTHENTICATED":
         return (

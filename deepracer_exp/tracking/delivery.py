@@ -112,7 +112,7 @@ def undelivered(folders: Iterable[Path]) -> dict[Path, str]:
     Raises:
         BadInput: a tracking.json is invalid.
     """
-    ended = [one for one in folders if (one / TRACKING).exists() and (one / SUMMARY).exists()]
+    ended = [folder for folder in folders if (folder / TRACKING).exists() and (folder / SUMMARY).exists()]
     tracked = {folder: read_tracked_run(folder / TRACKING) for folder in ended}
     return {folder: run.store for folder, run in tracked.items() if not run.complete}
 
@@ -140,8 +140,8 @@ def recorded_labels(run_id: str, uri: str | None, runs_dir: Path) -> Labels:
     """
     with open_client(run_id, uri, runs_dir) as client:
         tags = client.get_run(run_id).data.tags
-    own = {key.removeprefix(USER_TAG): value for key, value in tags.items() if key.startswith(USER_TAG)}
-    return Labels(tags.get(NAME), tags.get(USER_NOTE), own)
+    labels = {key.removeprefix(USER_TAG): value for key, value in tags.items() if key.startswith(USER_TAG)}
+    return Labels(tags.get(NAME), tags.get(USER_NOTE), labels)
 
 
 @contextmanager

@@ -24,9 +24,9 @@ def rows_of_store(uri: str, runs_dir: Path) -> list[Row]:
         BadInput: the store does not answer.
     """
     with open_client("runs", uri, runs_dir, _STORE_S) as client:
-        names = {one.experiment_id: one.name for one in pages(client.search_experiments)}
-        found = list(pages(client.search_runs, experiment_ids=list(names)))
-    rows = [_of_store(run, names[run.info.experiment_id]) for run in found if KIND not in run.data.tags]
+        names = {experiment.experiment_id: experiment.name for experiment in pages(client.search_experiments)}
+        runs = list(pages(client.search_runs, experiment_ids=list(names)))
+    rows = [_of_store(run, names[run.info.experiment_id]) for run in runs if KIND not in run.data.tags]
     return sorted(rows, key=lambda row: (row["began"], row["run"]), reverse=True)
 
 
@@ -55,4 +55,8 @@ def _of_store(run: Any, experiment: str) -> Row:
 
 
 def _printable(value: Any) -> Any:
-    return "".join(one if one.isprintable() else " " for one in value) if isinstance(value, str) else value
+    return (
+        "".join(character if character.isprintable() else " " for character in value)
+        if isinstance(value, str)
+        else value
+    )

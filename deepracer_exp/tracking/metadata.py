@@ -136,8 +136,8 @@ def user_tags() -> dict[str, str]:
 
 def label_tags(labels: Labels) -> dict[str, str]:
     """Return the tags of a run that say what people say of it."""
-    given = {NAME: labels.name, USER_NOTE: labels.note}
-    tags = {key: value for key, value in given.items() if value is not None}
+    values = {NAME: labels.name, USER_NOTE: labels.note}
+    tags = {key: value for key, value in values.items() if value is not None}
     return tags | labels.named_tags
 
 
@@ -156,7 +156,7 @@ def run_params(
     values = {
         key: value
         for key, value in flatten(config).items()
-        if any(f"{key}.".startswith(f"{one}.") for one in compared)
+        if any(f"{key}.".startswith(f"{prefix}.") for prefix in compared)
     }
     return {key: param_text(value) for key, value in {**values, **choices, **names}.items()}
 

@@ -113,8 +113,8 @@ def evaluate_metric(column: str, track: str | None) -> str:
 
 def metric_name(column: str) -> str:
     """Return MLflow's name of a column of metrics.jsonl."""
-    own, slash, track = column.partition("/")
-    return (METRICS[own][0] if own in METRICS else f"train/{own}") + slash + track
+    name, slash, track = column.partition("/")
+    return (METRICS[name][0] if name in METRICS else f"train/{name}") + slash + track
 
 
 _LONGEST_LABEL = 80  # MLflow takes 250 characters, older servers fewer; the UI shows about 40
@@ -140,12 +140,12 @@ def track_labels(names: Sequence[str]) -> list[str]:
     plain = [re.sub(r"[^A-Za-z0-9_.-]", "_", name)[:_LONGEST_LABEL] for name in names]
     # A path component of dots alone would point elsewhere.
     plain = [label if label.strip(".") else f"track_{label}" for label in plain]
-    given = {label.casefold() for label in plain}
+    taken = {label.casefold() for label in plain}
     labels: list[str] = []
     used: set[str] = set()
     for label in plain:
         chosen, number = label, 1
-        while chosen.casefold() in used or (number > 1 and chosen.casefold() in given):
+        while chosen.casefold() in used or (number > 1 and chosen.casefold() in taken):
             number += 1
             chosen = f"{label}-{number}"
         used.add(chosen.casefold())

@@ -187,11 +187,11 @@ class MLflowRun:
         if STUDY in tags:  # whose winner is chosen by its own objective, over seeds and fresh laps
             return
         score = f"metrics.`{BEST}score_s`"
-        found = self._client.search_runs(
+        fastest = self._client.search_runs(
             [experiment_id], f"{score} > 0", max_results=1, order_by=[f"{score} ASC"]
         )
-        if found and tags.get(NOTE, OURS).startswith(OURS):
-            (run,) = found
+        if fastest and tags.get(NOTE, OURS).startswith(OURS):
+            (run,) = fastest
             best = {key: value for key, value in run.data.metrics.items() if key.startswith(BEST)}
             note = experiment_note(run.info.run_name, run.info.run_id, experiment_id, best)
             self._client.set_experiment_tag(experiment_id, NOTE, note)
@@ -220,8 +220,8 @@ class MLflowRun:
             self._client.set_terminated(self.run_id, status, end_ms)
 
     def _experiment_id(self, name: str) -> str:
-        found = self._client.get_experiment_by_name(name)
-        if found is None:
+        experiment = self._client.get_experiment_by_name(name)
+        if experiment is None:
             try:
                 return self._client.create_experiment(
                     name, self._store.artifact_location, dict(EXPERIMENT_TAGS)
@@ -229,12 +229,12 @@ class MLflowRun:
             except MlflowException as error:
                 if error.error_code != "RESOURCE_ALREADY_EXISTS":
                     raise
-                found = self._client.get_experiment_by_name(name)  # another process created it
-        if found.lifecycle_stage != "active":
+                experiment = self._client.get_experiment_by_name(name)  # another process created it
+        if experiment.lifecycle_stage != "active":
             raise StoreRefusedError(
                 f"experiment {name!r} was deleted in MLflow; restore it there or choose another name="
             )
-        return found.experiment_id
+        return experiment.experiment_id
 
     def _create(self, experiment_id: str, tracked: TrackedRun) -> str:
         self._tags = {key: value[:MAX_TAG_VAL_LENGTH] for key, value in tracked.tags.items()}

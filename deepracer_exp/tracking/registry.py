@@ -86,16 +86,16 @@ def look_up(reference: str, uri: str | None, runs_dir: Path) -> Registered:
     Raises:
         BadInput: no model or several have it, it was not registered by us, or the store does not answer.
     """
-    model, at, alias = reference.rpartition("@")
+    model, separator, alias = reference.rpartition("@")
     check_alias(reference, alias)
-    if at:
+    if separator:
         check_model(reference, model)
-    known = _aliases(reference, uri, runs_dir)
-    matches = [one for one in known if one == (model, alias) or (not at and one[1] == alias)]
+    aliases = _aliases(reference, uri, runs_dir)
+    matches = [pair for pair in aliases if pair == (model, alias) or (not separator and pair[1] == alias)]
     if len(matches) == 1:
         with open_client(reference, uri, runs_dir) as client:
             return _registered(reference, client.get_model_version_by_alias(*matches[0]), alias)
-    names = [f"{name}@{given}" for name, given in matches or known]
+    names = [f"{name}@{alias_name}" for name, alias_name in matches or aliases]
     if matches:
         raise BadInput(
             reference,
@@ -115,7 +115,7 @@ def _aliases(what: str, uri: str | None, runs_dir: Path) -> list[tuple[str, str]
             return database.execute("SELECT name, alias FROM registered_model_aliases").fetchall()
     with open_client(what, uri, runs_dir) as client:
         models = pages(client.search_registered_models)
-        return [(found.name, name) for found in models for name in found.aliases]
+        return [(model.name, name) for model in models for name in model.aliases]
 
 
 def promote(
@@ -165,12 +165,12 @@ def promote(
         if recorded.lifecycle_stage != "active":
             raise BadInput(what, f"was deleted in MLflow (run {run_id}); restore it there")
         pin(run / CHECKPOINTS, folder.name, f"registered as {model}")
-        if not any(found.name == model for found in pages(client.search_registered_models)):
+        if not any(registered.name == model for registered in pages(client.search_registered_models)):
             client.create_registered_model(
                 model, description=f"Policies of `deepracer-exp`, experiment `{model}`."
             )
         versions = pages(client.search_model_versions, filter_string=f"name = '{model}'")
-        version = next((found for found in versions if found.tags.items() >= tags.items()), None)
+        version = next((candidate for candidate in versions if candidate.tags.items() >= tags.items()), None)
         if version is None:
             metrics = _evaluated(run, folder)
             logged = _log_model(
@@ -235,8 +235,8 @@ def _log_model(
     client.log_model_artifacts(logged.model_id, str(checkpoint), "checkpoint")
     for key, value in metrics.items():
         # Exactly the run's own point, so that its curve has no duplicate.
-        known = [point for point in client.get_metric_history(run_id, key) if point.value == value]
-        moment = (known[-1].timestamp, known[-1].step) if known else (None, None)
+        points = [point for point in client.get_metric_history(run_id, key) if point.value == value]
+        moment = (points[-1].timestamp, points[-1].step) if points else (None, None)
         client.log_metric(run_id, key, value, *moment, model_id=logged.model_id)
     return client.finalize_logged_model(logged.model_id, "READY")
 
@@ -269,8 +269,13 @@ def read_overview(uri: str | None, runs_dir: Path) -> StoreOverview:
     with open_client("MLflow", uri, runs_dir) as client:
         from mlflow.entities import ViewType
 
-        experiments = [one.experiment_id for one in pages(client.search_experiments, view_type=ViewType.ALL)]
-        runs = pages(client.search_runs, experiment_ids=experiments, run_view_type=ViewType.ALL)
+        listed = pages(client.search_experiments, view_type=ViewType.ALL)
+        experiments = [each.experiment_id for each in listed]
+        runs = pages(
+            client.search_runs,
+            experiment_ids=[each.experiment_id for each in experiments],
+            run_view_type=ViewType.ALL,
+        )
         deleted = {run.info.run_id: run.info.lifecycle_stage != "active" for run in runs}
         registered = {
             (Path(version.tags[_RUN_DIR]).name, version.tags[_CHECKPOINT])

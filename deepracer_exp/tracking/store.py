@@ -120,11 +120,11 @@ def resolve_store(uri: str | None, runs_dir: Path) -> Store:
     uri, shown = with_password(uri), f"tracking.uri={without_passwords(uri)}"
     scheme, colon, _ = uri.partition("://")
     base = scheme.partition("+")[0]
-    known = (*_DATABASES, *_SERVERS)
-    if not colon or base not in known:
+    schemes = (*_DATABASES, *_SERVERS)
+    if not colon or base not in schemes:
         raise BadInput(
             shown,
-            f"not a store that MLflow can record in{nearest(base, known)}",
+            f"not a store that MLflow can record in{nearest(base, schemes)}",
             f"http(s)://host:port, {_SQLITE_PREFIX}/path/mlflow.db, postgresql://, mysql://, mssql://",
         )
     if base == "sqlite":
@@ -195,8 +195,8 @@ def client_of(store: Store, total_s: float | None = None) -> "MlflowClient":
 
     MLflow reads both from the environment at each request. In the address they would appear in its messages.
     """
-    for name, own in ((_USER, store.user), (_PASSWORD, store.password)):
-        if (value := own or _GIVEN[name]) is None:
+    for name, setting in ((_USER, store.user), (_PASSWORD, store.password)):
+        if (value := setting or _GIVEN[name]) is None:
             os.environ.pop(name, None)
         else:
             os.environ[name] = value

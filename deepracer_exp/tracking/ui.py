@@ -89,11 +89,11 @@ def running_ui(store: Store, port: int) -> Iterator[tuple[str, subprocess.Popen[
 def runs_page(url: str, uri: str | None, runs_dir: Path) -> str:
     """Return the address, in the UI at `url`, of the runs table with the newest run, with its racing columns."""
     with open_client(f"ui of {url}", uri, runs_dir) as client:
-        known = {one.experiment_id: one for one in pages(client.search_experiments)}
-        newest = client.search_runs(list(known), max_results=1, order_by=["attributes.start_time DESC"])
+        experiments = {listed.experiment_id: listed for listed in pages(client.search_experiments)}
+        newest = client.search_runs(list(experiments), max_results=1, order_by=["attributes.start_time DESC"])
     if not newest:
         return f"{url}/#/experiments?{WORKFLOW}"
-    experiment = known[newest[0].info.experiment_id]
+    experiment = experiments[newest[0].info.experiment_id]
     page = f"{url}/#/experiments/{experiment.experiment_id}/runs?{WORKFLOW}"
     return f"{page}&viewStateShareKey={VIEW}" if f"mlflow.sharedViewState.{VIEW}" in experiment.tags else page
 

@@ -66,15 +66,15 @@ class Budget:
         Of a limit of the experiment, the share is that of what the other runs leave: 0 at this run's start.
         """
         shares = []
-        for limit, own, others, most in self._spent(env_steps, iterations, wall_clock_s):
-            shares.append((limit, own / (most - others) if most > others else 1.0))
+        for limit, own_use, others, most in self._spent(env_steps, iterations, wall_clock_s):
+            shares.append((limit, own_use / (most - others) if most > others else 1.0))
         return max(shares, key=lambda share: share[1])
 
     def alerts(self, env_steps: int, iterations: int, wall_clock_s: float) -> list[Alert]:
         """Return what was passed since the last call, at most one alert a limit; the first call sets the start."""
         first, passed = not self._alerted, []
-        for limit, own, others, most in self._spent(env_steps, iterations, wall_clock_s):
-            spent = own + others
+        for limit, own_use, others, most in self._spent(env_steps, iterations, wall_clock_s):
+            spent = own_use + others
             percent = max((share for share in self._config.alerts if 100 * spent >= share * most), default=0)
             if not first and percent > self._alerted[limit]:
                 words = _WORDS_BY_KEY[limit]
@@ -99,23 +99,24 @@ class Budget:
         self, env_steps: int, iterations: int, wall_clock_s: float
     ) -> list[tuple[str, float, float, float]]:
         """Return of each limit its key, what this run has used of it, what the others have, and the limit."""
-        own = {
+        used_here = {
             "env_steps": env_steps,
             "iterations": iterations,
             "minutes": wall_clock_s / 60,
             "max_cost": self.cost(wall_clock_s) or 0.0,
         }
-        found = [(name, own[name], 0.0, most) for name, most in _limits(self._config).items()]
+        limits = [(name, used_here[name], 0.0, most) for name, most in _limits(self._config).items()]
         shared = _limits(self._config, _EXPERIMENT)
         if shared:
             # They may run at the same time.
             if time.monotonic() >= self._look_again_at:
                 self._others = _spent_in(self._folder.parent, self._config, besides=self._folder.name)
                 self._look_again_at = time.monotonic() + _REFRESH_S
-            found += [
-                (f"{_EXPERIMENT}{name}", own[name], self._others[name], most) for name, most in shared.items()
+            limits += [
+                (f"{_EXPERIMENT}{name}", used_here[name], self._others[name], most)
+                for name, most in shared.items()
             ]
-        return found
+        return limits
 
 
 def refuse_spent(config: BudgetConfig, experiment_dir: Path) -> None:

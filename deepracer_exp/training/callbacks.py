@@ -34,7 +34,7 @@ def standard_callbacks(
     names: Mapping[str, str],
     tracker: Tracker,
     console: Console,
-    own: Sequence[Callback] = (),
+    users: Sequence[Callback] = (),
 ) -> list[Callback]:
     """Return the callbacks of a run in the order in which they are called.
 
@@ -44,8 +44,8 @@ def standard_callbacks(
         names: what a racer calls the choices.
         tracker: records the run.
         console: shows the progress.
-        own: the caller's, called after evaluation and stopping rule and before anything is recorded: columns that they
-            add to `trainer.row` are recorded, and an iteration at which one raises is not.
+        users: the caller's, called after evaluation and stopping rule and before anything is recorded: columns that
+            they add to `trainer.row` are recorded, and an iteration at which one raises is not.
 
     Raises:
         BadInput: files or values of the evaluation or the alerts cannot be used.
@@ -53,7 +53,7 @@ def standard_callbacks(
     return [
         EvalCallback(experiment, console),
         StoppingCallback(build_rule(experiment.stopping, setup.actions.n), tracker),
-        *own,
+        *users,
         BudgetCallback(Alerts(experiment.budget), tracker),
         RecordCallback(),
         ReportCallback(),
@@ -142,12 +142,14 @@ class StoppingCallback(Callback):
         return {"stopping": self._decision and self._decision.as_dict(), "reliable": self._reliable}
 
     def _observe(self, trainer: Trainer) -> None:
-        found = self._rule.observe(trainer.row)
+        decision = self._rule.observe(trainer.row)
         try:  # before it is part of the summary, which is written even of a run that fails
-            json.dumps(found and found.as_dict())
+            json.dumps(decision and decision.as_dict())
         except (AttributeError, TypeError) as error:
-            raise RunFailed(f"{self._rule.__class__.__name__}.observe returned {found!r}: {error}") from error
-        self._decision = found
+            raise RunFailed(
+                f"{self._rule.__class__.__name__}.observe returned {decision!r}: {error}"
+            ) from error
+        self._decision = decision
         if self._decision is not None:
             trainer.request_stop(self._decision.ending)
 

@@ -65,10 +65,10 @@ def prepare_clone(
         BadInput: the parent or its checkpoint cannot be used, what the overrides ask for does not fit its networks, or
             its reward function is not the user's own.
     """
-    given = dict(override.split("=", 1) for override in overrides if override.split("=", 1)[0] in _OWN)
+    options = dict(override.split("=", 1) for override in overrides if override.split("=", 1)[0] in _OWN)
     changes = [override for override in overrides if override.split("=", 1)[0] not in _OWN]
-    parent = resolve(given["run"], runs_dir, tracking_uri)
-    name = parent.choose_checkpoint(given.get("checkpoint"))
+    parent = resolve(options["run"], runs_dir, tracking_uri)
+    name = parent.choose_checkpoint(options.get("checkpoint"))
     checkpoint = read_checkpoint(parent.experiment, parent.checkpoints, name)
     composition = _changed(parent, changes, stored)
     experiment = parse_experiment(composition.mapping)

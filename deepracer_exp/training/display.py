@@ -253,8 +253,8 @@ class ProgressDisplay:
         pairs = _PAIRS_OF_TRACKS if self._tracks else _PAIRS  # lap times are in the table
         left = width - _GAP - _RIGHT
         both = [
-            Text(" " * _GAP).join((self._cell(one, left, _LEFT_LABEL), self._cell(other, _RIGHT)))
-            for one, other in (*pairs, *_PAIRS_OF_STEPS)
+            Text(" " * _GAP).join((self._cell(first, left, _LEFT_LABEL), self._cell(other, _RIGHT)))
+            for first, other in (*pairs, *_PAIRS_OF_STEPS)
         ]
         return [*both[: len(pairs)], Text(""), *both[len(pairs) :]]
 
@@ -301,11 +301,11 @@ class TrackTable:
 
     def add(self, row: Row) -> None:
         """Add the figures of an iteration."""
-        for metric, known in (("completion", self._completion), ("best_lap_time_s", self._best_s)):
+        for metric, series in (("completion", self._completion), ("best_lap_time_s", self._best_s)):
             for label in self._labels:
                 value = _value(row, track_metric(metric, label))
                 if value is not None:
-                    known[label] = value
+                    series[label] = value
 
     def least(self) -> str:
         """Name the track with the lowest completion."""

@@ -63,9 +63,11 @@ def import_model(path: str, name: str, overrides: Sequence[str]) -> Imported:
     Raises:
         BadInput: there is no model, it cannot be used here, or the run cannot be written; nothing is left.
     """
-    given = [one.removeprefix(_CHECKPOINT) for one in overrides if one.startswith(_CHECKPOINT)]
-    changes = [one for one in overrides if not one.startswith(_CHECKPOINT)]
-    wanted = given[-1] if given else "best"
+    checkpoints = [
+        override.removeprefix(_CHECKPOINT) for override in overrides if override.startswith(_CHECKPOINT)
+    ]
+    changes = [override for override in overrides if not override.startswith(_CHECKPOINT)]
+    wanted = checkpoints[-1] if checkpoints else "best"
     if wanted not in ("best", "last"):
         raise BadInput(f"checkpoint={wanted}", "", "best, last (of the service's deepracer_checkpoints.json)")
     model = read_model(path, wanted)
@@ -89,11 +91,11 @@ def _import(model: StoredModel, path: str, aside: str, name: str, changes: Seque
     seen = sensor_overrides(files.metadata)
     experiment, composition, networks, network, absent = _fit(model, files, seen, name, changes)
     load_reward_source(experiment.reward)
-    own = {key_of(line): line for line in changes}
-    options = import_files(files, name, composition.mapping, [*network, *seen], path, own)
+    by_key = {key_of(line): line for line in changes}
+    options = import_files(files, name, composition.mapping, [*network, *seen], path, by_key)
     # No option file can choose several tracks, so that the experiment has none of them.
-    job, of_job = job_overrides(files.workers, own)
-    several, applied = several_of(job), [*car_override(files, own)[1], *of_job]
+    job, of_job = job_overrides(files.workers, by_key)
+    several, applied = several_of(job), [*car_override(files, by_key)[1], *of_job]
     try:
         experiment, composition = compose_experiment([f"experiment={name}", *several, *changes])
         result = store_run(experiment, composition, networks, f"imported from {model.source}")

@@ -145,8 +145,8 @@ class RunMetrics:
         None before as many episodes as are remembered have ended on every track.
         """
         shares = [record.lap_share for record in self.tracks]
-        known = [share for share in shares if share is not None]
-        return min(known) if len(known) == len(shares) else None
+        measured = [share for share in shares if share is not None]
+        return min(measured) if len(measured) == len(shares) else None
 
     def row(self, finished: Finished) -> dict[str, float | None]:
         """Return the figures of the episodes of an iteration, means over episodes.
@@ -177,8 +177,8 @@ class RunMetrics:
         """Take over a `state_dict`."""
         book = state["book"]
         self._number, self._next_number = book["number"].copy(), book["next_number"]
-        for record, own in zip((self.all, *self.tracks), book["records"], strict=True):
-            record.load_state_dict(own)
+        for record, stored in zip((self.all, *self.tracks), book["records"], strict=True):
+            record.load_state_dict(stored)
         self._last = [dict(last) for last in state["last"]]
 
     def summary(self) -> dict[str, Any]:

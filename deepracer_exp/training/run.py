@@ -284,9 +284,9 @@ def _described(
     """Return the name, parameters and tags that a run is recorded with."""
     folder, experiment = trainer.folder, trainer.experiment
     lineage = read_lineage(folder.path)
-    own = run_tags(names, commit, trainer.setup.reward.sha256, folder.path.resolve())
+    run_own_tags = run_tags(names, commit, trainer.setup.reward.sha256, folder.path.resolve())
     if lineage is not None:
-        own |= lineage_tags(lineage)
+        run_own_tags |= lineage_tags(lineage)
     # MLflow's table shows some 20 characters; the folder's name is in the tag run_dir.
     what = names["reward"] if lineage is None else f"clone {lineage.generation}"
     return TrackedRun(
@@ -294,7 +294,7 @@ def _described(
         experiment=experiment.name,
         start_ms=now_ms(),
         params=run_params(composition.choices, names, composition.mapping, composition.overrides),
-        tags={**own, **tags},
+        tags={**run_own_tags, **tags},
     )
 
 
@@ -421,8 +421,8 @@ def _ended(trainer: Trainer, interruption: Interruption) -> TrainResult:
             )
             what = f"collector.cars={cars}, algorithm.frames_per_iteration={frames}: {NO_MEMORY}"
             return trainer.fail(what, error, RunFailed.exit_code if trainer.row else BadInput.exit_code)
-        if own := _own_error(error, trainer.experiment):
-            return trainer.fail(own, error)
+        if own_error := _own_error(error, trainer.experiment):
+            return trainer.fail(own_error, error)
         # A bug: its traceback is shown, but the run must not look as if it were running.
         trainer.fail(f"{type(error).__name__}: {error}", error)
         raise
@@ -435,10 +435,10 @@ def _own_error(error: Exception, experiment: Experiment) -> str | None:
         return None
     modules = [target.partition(":")[0] for _, target in classes]
     frames = list(traceback.walk_tb(error.__traceback__))
-    theirs = [at for at in frames if at[0].f_globals.get("__name__") in modules]
+    theirs = [entry for entry in frames if entry[0].f_globals.get("__name__") in modules]
     frame, line = (theirs or frames)[-1]
-    own = ", ".join(f"{group}.target={target}" for group, target in classes)
-    return f"{type(error).__name__}: {error} ({Path(frame.f_code.co_filename).name}, line {line}; with {own})"
+    targets = ", ".join(f"{group}.target={target}" for group, target in classes)
+    return f"{type(error).__name__}: {error} ({Path(frame.f_code.co_filename).name}, line {line}; with {targets})"
 
 
 def _differences_to_uninterrupted(experiment: Experiment, setup: RaceSetup) -> list[str]:

@@ -27,7 +27,7 @@ def find_teacher(experiment: Experiment) -> StoredRun | None:
     stored = read_checkpoint(run.experiment, run.checkpoints, run.choose_checkpoint(None))
     what = f"teacher={experiment.teacher}"
     theirs, ours = (
-        describe_actions(build_action_space(one.action_space)) for one in (run.experiment, experiment)
+        describe_actions(build_action_space(side.action_space)) for side in (run.experiment, experiment)
     )
     if theirs != ours:
         raise BadInput(what, f"has other actions: {theirs}", f"a run with {ours}")
@@ -38,7 +38,7 @@ def find_teacher(experiment: Experiment) -> StoredRun | None:
             raise BadInput(
                 what, f"sees other {key}", f"a run with the same {sensor}, or observation=features"
             )
-    features = [replace(one, camera=None, lidar=None) for one in (before, now)]
+    features = [replace(observation, camera=None, lidar=None) for observation in (before, now)]
     if "observation" in sees and features[0] != features[1]:
         raise BadInput(what, "sees other features", "a run whose features are those of this observation")
     return StoredRun(run.path, stored.path.name)

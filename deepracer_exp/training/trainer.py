@@ -250,7 +250,8 @@ class Trainer:
                 if self.ending or self._save_requested or self._is_time_to_save():
                     self.save(collector, is_best)
         assert self.ending is not None
-        if interruption.signum is None or not any(one.hurries_when_interrupted for one in self.callbacks):
+        hurry = any(callback.hurries_when_interrupted for callback in self.callbacks)
+        if interruption.signum is None or not hurry:
             self.evaluation = None
             self._call("on_train_end")
             if self.best.evaluated_best(self.evaluation, self.counters()):

@@ -29,7 +29,7 @@ def test_another_seed_or_car_gives_other_numbers(one, other):
 def test_every_stream_has_numbers_of_its_own():
     """The numbers of seed, purpose, car and stream are not interchangeable."""
     numbers = [
-        CarStreams(seed, [car], purpose).at(0, number).random(50)
+        CarStreams(seed, [car], purpose).stream(0, number).random(50)
         for seed, purpose, car, number in itertools.product((0, 1, 2), Purpose, (0, 1, 2), (0, 1, 2, 700))
     ]
     assert len(np.unique(numbers)) == np.size(numbers)
@@ -37,13 +37,13 @@ def test_every_stream_has_numbers_of_its_own():
 
 def test_a_stream_holds_the_same_whatever_was_drawn_before():
     streams = CarStreams(4, [3, 8], Purpose.EPISODE)
-    first = streams.at(1, 5).random(7)
-    streams.at(0, 5).integers(0, 9, 3)  # half a 64-bit number is left
-    streams.at(1, 4).standard_normal(1001)
-    np.testing.assert_array_equal(streams.at(1, 5).random(7), first)
-    streams.at(1, 4).integers(0, 9, 1, dtype=np.int32)
-    whole = CarStreams(4, [8], Purpose.EPISODE).at(0, 5).integers(0, 2**31, 5, dtype=np.int32)
-    np.testing.assert_array_equal(streams.at(1, 5).integers(0, 2**31, 5, dtype=np.int32), whole)
+    first = streams.stream(1, 5).random(7)
+    streams.stream(0, 5).integers(0, 9, 3)  # half a 64-bit number is left
+    streams.stream(1, 4).standard_normal(1001)
+    np.testing.assert_array_equal(streams.stream(1, 5).random(7), first)
+    streams.stream(1, 4).integers(0, 9, 1, dtype=np.int32)
+    whole = CarStreams(4, [8], Purpose.EPISODE).stream(0, 5).integers(0, 2**31, 5, dtype=np.int32)
+    np.testing.assert_array_equal(streams.stream(1, 5).integers(0, 2**31, 5, dtype=np.int32), whole)
 
 
 def test_no_number_comes_twice_across_the_blocks():
