@@ -29,7 +29,7 @@ _HIDDEN_GAIN, _POLICY_GAIN, _VALUE_GAIN = math.sqrt(2), 0.01, 1.0
 _CRITIC_HIDDEN = (64, 64)
 """Units of a value network that sees features beside a policy that sees pictures."""
 _INITIAL_STD = 0.5
-"""Of a continuous policy on a network of the user's own that has no attribute `initial_std`."""
+"""Initial standard deviation of a continuous policy on a user's network without an attribute `initial_std`."""
 
 
 class ActorCritic(nn.Module):
@@ -52,9 +52,9 @@ class ActorCritic(nn.Module):
 
     @property
     def policy(self) -> TensorDictModuleBase:
-        """What collectors drive with: what is seen -> `action` and `action_log_prob`; it shares these parameters.
+        """The module that collectors drive with, from `in_keys` to `action` and `action_log_prob`.
 
-        What is seen is `observation`, or `pixels` and `lidar` where there are such sensors. It samples;
+        It shares the parameters. Its input is `observation`, or `pixels` and `lidar` of such sensors. It samples;
         `set_exploration_type(ExplorationType.DETERMINISTIC)` makes it take the likeliest action. A discrete action is
         an int64 index of shape [...], a continuous one two unbounded float32 numbers, which the environment clips to
         -1..1. The distribution's parameters are written beside them (`logits`, or `loc` and `scale`).
@@ -68,14 +68,14 @@ class ActorCritic(nn.Module):
 
     @property
     def value(self) -> TensorDictModuleBase:
-        """What is seen, or `observation` beside it, -> `state_value` of shape [..., 1]."""
+        """The module from `in_keys`, or `observation`, to `state_value` of shape [..., 1]."""
         if self.trunk is None:
             return self.value_head
         return ActorValueOperator(self.trunk, self.policy_head, self.value_head).get_value_operator()
 
     @property
     def in_keys(self) -> list[str]:
-        """What policy and value read."""
+        """Entries that policy and value read."""
         return sorted({*self.policy.in_keys, *self.value.in_keys})
 
 

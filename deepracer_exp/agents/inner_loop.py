@@ -26,12 +26,12 @@ Floats = NDArray[np.float32]
 
 _ACTIVATIONS: dict[type[nn.Module], int] = {nn.ReLU: 0, nn.Tanh: 1, nn.ELU: 2, nn.SiLU: 3}
 _LEAST_LOG_STD = math.log(1e-4)
-"""Below it, the standard deviation of the library's `AddStateIndependentNormalScale` stays as it is."""
+"""Log below which the standard deviation of the library's `AddStateIndependentNormalScale` stays as it is."""
 _HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 _BETA1, _BETA2 = 0.9, 0.999
 _NO_SCALE: Floats = np.zeros(0, np.float32)
 COLUMNS = ("policy loss", "value loss", "entropy", "clip fraction", "kl", "gradient norm")
-"""What is returned for each gradient step: the value loss is weighted by `critic_coeff`, entropy and `kl` are in nats,
+"""Columns returned for each gradient step: the value loss is weighted by `critic_coeff`, entropy and `kl` are in nats,
 and the norm is that before clipping."""
 
 # Sums may be reordered; NaN and infinity must stay what they are, since they end a run.

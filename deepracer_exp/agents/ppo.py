@@ -37,21 +37,21 @@ _LOSS_NAMES = {
 
 @dataclass(frozen=True, kw_only=True)
 class UpdateMetrics:
-    """What one update did; means over its gradient steps unless said otherwise. A subclass may add columns."""
+    """Figures of one update, means over its gradient steps unless said otherwise. A subclass may add columns."""
 
     policy_loss: float
     value_loss: float
-    """Before it is weighted by `critic_coeff`."""
+    """Loss of the value network before it is weighted by `critic_coeff`."""
     entropy: float
-    """In nats."""
+    """Entropy of the policy in nats."""
     kl: float
     """KL divergence of the collecting policy from the updated one, estimated over the last epoch."""
     clip_fraction: float
     """Share of steps whose probability ratio was clipped."""
     explained_variance: float
-    """Of the value targets by the values before the update; 1 is perfect, 0 no better than their mean."""
+    """Share of the variance of the value targets that the values before the update explain; 1 is perfect."""
     grad_norm: float
-    """Before clipping."""
+    """Norm of the gradient before clipping."""
     lr: float
 
 
@@ -177,7 +177,7 @@ class PPO(Algorithm):
 
     @property
     def _inner_loop(self) -> InnerLoop | None:
-        """What makes the gradient steps of `loss`; None: autograd."""
+        """Return the compiled loop that makes the gradient steps of `loss`; None where autograd makes them."""
         is_ours = type(self).loss is PPO.loss and self._smoothness is None
         return self._compiled if is_ours else None
 

@@ -40,9 +40,9 @@ class EnvFactory:
     threads: int
     run_dir: Path
     heartbeat: Path | None = None
-    """None: the environment does not live in a worker process of this machine."""
+    """File of the counted steps; None if the environment does not live in a worker process of this machine."""
     prints: RewardPrints | None = None
-    """Takes what reward functions print; None: the file in the run's folder."""
+    """Where the output of reward functions goes; None for the file in the run's folder."""
     on_step: Callable[[], None] | None = None
     """Called after every step; a worker process counts its own in `heartbeat` instead."""
 

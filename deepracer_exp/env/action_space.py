@@ -68,7 +68,7 @@ class ContinuousActions:
 
     @property
     def n(self) -> None:
-        """None: the space is continuous."""
+        """Number of actions; None if the space is continuous."""
         return None
 
     def commands(self, action: NDArray[Any]) -> Commands:

@@ -27,11 +27,11 @@ _MIDDLE = 127.5
 _SPOT_SIZE = (0.1, 0.5)
 """Standard deviation of a shadow or spot of light, as a share of the picture's width."""
 _DIRT_SPOTS, _DIRT_SIZE = 4, (0.015, 0.06)
-"""Of dirt: their number, and standard deviation as a share of the picture's width."""
+"""Number of dirt spots, and their standard deviation as a share of the picture's width."""
 _OBJECT_LOW_M, _OBJECT_HIGH_M = np.array([0.1, 0.1, 0.1]), np.array([0.6, 0.6, 0.9])
 """Length, width and height of objects: lower than the default walls."""
 _PLACES, _CLEARANCE_M, _BESIDE_M = 256, 0.05, 1.6
-"""Of objects: places per track, least distance from road and walls, largest distance from the border."""
+"""Places of objects per track, their least distance from road and walls, and largest from the border."""
 _NOISE_NUMBERS = 2**18
 """Standard normal numbers that all pictures take their noise from: drawing new ones would take longer than the
 picture."""

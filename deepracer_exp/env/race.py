@@ -141,7 +141,7 @@ class Race:
 
     @property
     def seen(self) -> dict[str, np.ndarray]:
-        """What networks may read: `observation`, with a camera `pixels`, and with a LIDAR `lidar`."""
+        """The entries that networks may read: `observation`, with a camera `pixels`, and with a LIDAR `lidar`."""
         seen = {"observation": self.observation}
         if self._pictures is not None:
             seen["pixels"] = self.pixels

@@ -63,7 +63,7 @@ def lap_clock_s(steps: ArrayLike, period_s: float) -> Floats:
 
 
 class EpisodeRules:
-    """What ends an episode, for N cars (deepracer-simapp, markov/reset/rules and rollout_agent_ctrl.py).
+    """The rules that end an episode, for N cars (deepracer-simapp, markov/reset/rules and rollout_agent_ctrl.py).
 
     A car's first step is the prepare step: it stands at its start pose and no rule is applied.
     """
@@ -124,19 +124,19 @@ class StepResult:
     now: Measures
     """The poses the rules were applied to."""
     running: Bools
-    """Not in the prepare step, so that rewards are paid."""
+    """Whether the car is past its prepare step, so that it gets rewards."""
     progress: Floats
     """Per cent of the lap."""
     previous_progress: Floats
     """Per cent of the lap at the step before; in the step of an episode's first reward, `progress`."""
     all_wheels_on_track: Bools
     off_track: Bools
-    """No wheel on the road."""
+    """Whether no wheel is on the road."""
     status: NDArray[np.int64]
     """Codes of `env.trace.STATUS_CODE`."""
     terminated: Bools
     truncated: Bools
-    """The drive was cut off where it could go on: at `episode.max_steps`, or at the end of a lap of a closed track."""
+    """Whether the drive was cut off where it could continue: at `episode.max_steps`, or at the end of a closed lap."""
 
 
 class RaceRules:

@@ -1,4 +1,4 @@
-"""Where cars are, measured against the track, and arrays of cars read back from a checkpoint."""
+"""Positions of cars relative to the track, and arrays of cars read back from a checkpoint."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 _PAIRS = ("front", "closest_waypoints")
 """Arrays with two numbers per car."""
 _TYPES = {"closest_waypoints": np.int64, "is_left": np.bool_}
-"""Of the arrays that are not float64."""
+"""Types of the arrays that are not float64."""
 
 
 def checked_array(state: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -53,11 +53,11 @@ class Measures:
     ndist: Floats
     """Projection on the centre line over its length."""
     distance_m: Floats
-    """From the centre line."""
+    """Distance from the centre line."""
     offset_m: Floats
-    """The same, positive to the left."""
+    """Distance from the centre line, positive to the left."""
     closest_waypoints: NDArray[np.int64]
-    """The one behind and the one ahead, (N, 2)."""
+    """Index of the waypoint behind and of the one ahead, (N, 2)."""
     heading_error_rad: Floats
     """Yaw against the centre line's heading, -pi to pi."""
     track_width_m: Floats

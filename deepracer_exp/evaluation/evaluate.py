@@ -39,7 +39,7 @@ CURES = {
     "timing": "action_delay_steps, observation_dropout",
     "controls": "speed_noise, motor_scale, servo_scale, in part",
 }
-"""What of `randomization=sim2real` prepares a policy for a part."""
+"""The parts of `randomization=sim2real` that prepare a policy for each part of the real car."""
 
 
 def results_table(

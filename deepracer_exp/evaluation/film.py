@@ -26,7 +26,7 @@ from .result import USUAL, Evaluation
 
 FRAMES_PER_S = 30.0
 _LINGER_S = 1.0
-"""The last frame is shown this long."""
+"""Seconds for which the last frame is shown."""
 _COLUMNS = [PACKED[name] for name in ("X", "Y", "yaw", "steer", "speed_mps", "progress")]
 
 
@@ -47,7 +47,7 @@ class Lap:
     progress: NDArray[np.float64]
     """Per cent of this lap."""
     time_s: NDArray[np.float64]
-    """Since its start, penalties included."""
+    """Seconds since the start of the lap, penalties included."""
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -109,7 +109,7 @@ class LapRecorder:
 
     @property
     def acted(self) -> TensorDict:
-        """What the policy read and wrote in the lap `seen_in`, [n]."""
+        """The tensors that the policy read and wrote in the lap `seen_in`, [n]."""
         return torch.stack(self._acted)
 
     def rows(self, attempt: Attempt) -> tuple[NDArray[np.intp], NDArray[np.float64]]:

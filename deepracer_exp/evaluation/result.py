@@ -41,7 +41,7 @@ class TrialGroup:
     """Rows of the batch."""
     attempts: tuple[Attempt, ...]
     zigzags: "tuple[ZigZag, ...]" = ()
-    """Of each trial; empty where it was not measured."""
+    """Zig-zag of each trial; empty where it was not measured."""
 
     @property
     def decided(self) -> list[Attempt]:

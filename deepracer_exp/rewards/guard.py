@@ -23,7 +23,7 @@ _REFUSED: tuple[tuple[Any, str], ...] = (
     ),
     *((owner, "start") for owner in (threading.Thread, BaseProcess)),
 )
-"""What guarded code must not call, as owner and name."""
+"""Functions that guarded code must not call, as owner and name."""
 
 
 class Misconduct(BaseException):

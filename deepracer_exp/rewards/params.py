@@ -20,7 +20,7 @@ _DTYPES: dict[str, type] = {
 COLUMNS = tuple(_DTYPES)
 """The keys that differ from car to car: one row per car, two numbers a row in `closest_waypoints`."""
 BATCH_COLUMNS = (*COLUMNS, "previous_progress")
-"""Those of `reward_batch`, which has the progress at the step before, where `reward_function` remembers its last call.
+"""Columns of `reward_batch`, with the progress at the step before, which `reward_function` remembers by itself.
 
 Per cent of the lap; at the first step of an episode that is rewarded, the progress itself.
 """

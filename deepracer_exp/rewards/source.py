@@ -20,7 +20,7 @@ class RewardSource:
     path: str
     text: str
     sha256: str
-    """Of the file's bytes, before constants are set."""
+    """Hash of the file's bytes, before constants are set."""
     constants: Mapping[str, int | float]
     """The tunable constants and their values in the file."""
     overrides: Mapping[str, int | float]
@@ -37,7 +37,7 @@ NO_REWARD = RewardSource(
     constants={},
     overrides={},
 )
-"""For laps that are only timed: a run's own reward function may no longer exist."""
+"""Reward function of laps that are only timed: a run's own may no longer exist."""
 
 
 def zoo_names() -> list[str]:

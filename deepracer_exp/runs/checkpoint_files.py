@@ -1,4 +1,4 @@
-"""What is stored beside the tensors of checkpoints: hashes of their files, and which of them must stay."""
+"""Files beside the tensors of checkpoints: hashes of the files, and the pins of checkpoints that must stay."""
 
 import hashlib
 import json

@@ -30,7 +30,7 @@ SPARE_CHECKPOINTS = "checkpoints neither best nor last"
 FAILED_TRACE = "trace of a failed run"
 WHOLE_TRACE, EARLY_TRACE = "trace of a finished run", "trace of a finished run, all but its newest iterations"
 THIN, DROP = "thin", "drop"
-"""What may be done with the traces of finished runs."""
+"""Two ways to shrink the traces of finished runs."""
 ASKED = "run that was asked for"
 DELETED = "run deleted in MLflow"
 

@@ -1,4 +1,4 @@
-"""What failed and in which state, on disk."""
+"""Crash dumps: the error of a failed run and its tensors, on disk."""
 
 import contextlib
 import json

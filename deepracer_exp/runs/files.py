@@ -30,7 +30,7 @@ TRACKING = "tracking.json"
 LABELS = "labels.json"
 """Name, note and tags that people gave the run."""
 LINEAGE = "lineage.json"
-"""In a clone's folder."""
+"""File in a clone's folder."""
 REWARD_PRINTS = "reward_prints.log"
 RUNNING = ".running"
 """Locked by the process that trains in the folder, and there as long as it does."""
@@ -40,13 +40,13 @@ EXPORTS, TENSORBOARD, WANDB = "export", "tensorboard", "wandb"
 TEACHER = "teacher"
 """Folders within."""
 BEST_OF_SWEEP = "best_of_sweep.json"
-"""Beside the runs of a sweep."""
+"""File beside the runs of a sweep."""
 MLFLOW_DB = "mlflow.db"
-"""In `runs_dir`."""
+"""Database in `runs_dir`."""
 BEST = "best:"
-"""Before the name of an experiment: its best run."""
+"""Prefix of an experiment's name that means its best run."""
 RUN = "a run's folder, its name or the beginning of it, MLflow's id, best:EXPERIMENT, MODEL@ALIAS or ALIAS"
-"""What commands accept for a run."""
+"""The forms in which commands accept a run."""
 
 
 def is_run(folder: Path) -> bool:
@@ -61,7 +61,7 @@ def run_folders(runs_dir: Path) -> list[Path]:
 
 @dataclass(frozen=True)
 class RunRecord:
-    """What a run's files hold."""
+    """The contents of a run's files."""
 
     path: Path
     config: dict[str, Any]
@@ -71,7 +71,7 @@ class RunRecord:
     summary: dict[str, Any]
     """Empty while the run is running, or if it was killed."""
     provenance: dict[str, Any]
-    """Where code and reward come from."""
+    """Origin of code and reward function."""
 
     @property
     def name(self) -> str:

@@ -26,7 +26,7 @@ HARMLESS = (
 _MEASURED_BY = "stopping.episodes"
 """Number of episodes behind `lap_share` in every row of metrics.jsonl."""
 REMEMBERED_EPISODES = 50
-"""That number where the stopping rule has none."""
+"""Number of remembered episodes where the stopping rule has none."""
 
 
 def fingerprint(config: Mapping[str, Any], setup: RaceSetup) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What people say of a run: a name, a note and tags, in its folder and, as tags, in MLflow."""
+"""Labels that people give a run: a name, a note and tags, in its folder and, as tags, in MLflow."""
 
 import json
 import re
@@ -25,7 +25,7 @@ class Labels:
     """labels.json of a run folder."""
 
     name: str | None = None
-    """By which lists show the run and commands find it, beside its folder's name."""
+    """Name by which lists show the run and commands find it, beside its folder's name."""
     note: str | None = None
     tags: dict[str, str] = field(default_factory=dict)
 

@@ -29,7 +29,7 @@ class Lineage:
     parent: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
     """Name of the parent's folder."""
     parent_dir: str
-    """That folder as it was then, absolute."""
+    """Absolute path of the parent's folder at that time."""
     parent_run_id: str | None
     """MLflow's id of the parent."""
     checkpoint: Annotated[str, Field(pattern=r"^\d{6,9}$")]
@@ -96,12 +96,12 @@ class FamilyMember:
     name: str
     path: Path
     record: RunRecord | None
-    """None: its folder is gone."""
+    """The run's files; None if its folder is gone."""
     lineage: Lineage | None
-    """None: it is no clone, or gone."""
+    """The run's parents; None if it is no clone, or gone."""
     generation: int
     result: RunResult | None
-    """None: not known."""
+    """The run's result; None if it is not known."""
     children: "list[FamilyMember]" = field(default_factory=list)
     changes: dict[str, tuple[Any, Any]] = field(default_factory=dict)
     """Values that differ from the parent's, by dotted key: the parent's and its own."""

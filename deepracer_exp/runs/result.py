@@ -1,4 +1,4 @@
-"""How a run ended and how good its best checkpoint is, by its summary."""
+"""The result of a run by its summary: its end, and the figures of its best checkpoint."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -24,7 +24,7 @@ CRITERIA = {
     "progress": "completion (usual and held-out)",
     IN_TRAINING: "exploring laps",
 }
-"""What a measure is called; the best of several policies or runs is the one with the highest rank by it."""
+"""Names of the measures; the best of several policies or runs is the one with the highest rank by it."""
 FIGURES: tuple[tuple[str, str, str, int], ...] = (
     ("mean usual lap, s", "lap_time_s", "{:.2f}", -1),
     ("usual laps complete, %", "laps_percent", "{:.0f}", 1),
@@ -77,23 +77,23 @@ class Ending:
 
 @dataclass(frozen=True, kw_only=True)
 class RunResult:
-    """How good a run's best policy is."""
+    """The figures of a run's best policy."""
 
     measure: str
-    """What its evaluations were ranked by, a key of CRITERIA; IN_TRAINING: it had none, and its training's episodes
-    count."""
+    """The measure by which its evaluations were ranked, a key of CRITERIA; IN_TRAINING if it had none, and its
+    training's episodes count."""
     rank: tuple[float, float]
-    """Compared in order, higher is better; only with runs of the same measure, course and conditions."""
+    """Numbers compared in order, higher is better; only with runs of the same measure, course and conditions."""
     iteration: int | None = None
-    """After which the policy was evaluated, the number of its checkpoint; None: not evaluated."""
+    """Iteration after which the policy was evaluated, the number of its checkpoint; None without an evaluation."""
     race_score_s: float | None = None
     """Seconds per complete lap on usual and held-out conditions, failed laps included."""
     laps_percent: float | None = None
     """Complete laps of a hundred tried on the usual conditions."""
     completion: float | None
-    """Per cent of the lap, mean over the laps tried on the usual conditions."""
+    """Completion in per cent of the lap, mean over the laps tried on the usual conditions."""
     held_out_completion: float | None = None
-    """The same on the held-out conditions."""
+    """Completion in per cent on the held-out conditions."""
     lap_time_s: float | None
     """Mean of the evaluated complete laps on the usual conditions, or the fastest exploring lap."""
 
@@ -136,13 +136,13 @@ class ReliableLap:
     """The lap of the evaluated policy that was the fastest of the reliable ones of its run."""
 
     iteration: int
-    """After which the policy was evaluated, the number of its checkpoint."""
+    """Iteration after which the policy was evaluated, the number of its checkpoint."""
     lap_time_s: float
-    """Mean of its complete laps on the usual conditions, with several tracks of all of them."""
+    """Mean of the complete laps on the usual conditions, over all tracks together."""
     laps: int
     """Complete laps on the usual conditions."""
     laps_tried: int
-    """Laps tried there."""
+    """Laps tried on the usual conditions."""
 
     def __str__(self) -> str:
         """Return it in words: ``checkpoint 40, 6.72 s, 8 of 8``."""

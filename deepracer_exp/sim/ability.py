@@ -1,4 +1,4 @@
-"""What a simulated car can do at most, measured by driving many cars at random."""
+"""The limits of a simulated car, measured by driving many cars at random."""
 
 import numpy as np
 from numpy.typing import NDArray

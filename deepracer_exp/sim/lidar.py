@@ -8,8 +8,8 @@ from .scenery import box_corners
 
 RAYS = 64
 ANGLES_RAD = np.linspace(-2.61799, 2.61799, RAYS)
-"""From the sensor's middle direction, the rightmost first (these numbers and the next two: deepracer-simapp,
-`bundle/markov/sensors/constants.py`)."""
+"""Angles of the rays from the sensor's middle direction, the rightmost first (these numbers and the next two:
+deepracer-simapp, `bundle/markov/sensors/constants.py`)."""
 NEAREST_M, FURTHEST_M = 0.15, 12.0
 SCANS_PER_S = 10
 """Slower than the camera: every third control step sees the scan of the step before (`racecar.gazebo`)."""

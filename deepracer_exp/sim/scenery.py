@@ -1,4 +1,4 @@
-"""What there is to see around a track: outlines of its road, lines and walls, and boxes that stand on the floor.
+"""The scenery of a track: outlines of its road, lines and walls, and boxes that stand on the floor.
 
 Sizes are those of the service's worlds (deepracer-simapp, `bundle/meshes`).
 """
@@ -17,13 +17,13 @@ from deepracer_exp.tracks.outline import rings_of
 from deepracer_exp.tracks.track import Track
 
 LINE_WIDTH_M = 0.0762
-"""Of the edge lines; where they lie inside the road, its border is their outer edge."""
+"""Width of the edge lines; where they lie inside the road, its border is their outer edge."""
 DASH_WIDTH_M = 0.0254
-"""Of the centre line."""
+"""Width of the dashed centre line."""
 KERB_WIDTH_M, KERB_LENGTH_M, KERB_GAP_M = 0.0762, 0.185, 0.185
-"""Of the coloured parts of kerbs, which lie beyond edge lines; the gaps are white as the lines."""
+"""Size of the coloured parts of kerbs, which lie beyond edge lines; the gaps are white as the lines."""
 START_AHEAD_M, START_LENGTH_M, START_WIDTH_M = 0.13, 0.0733, 0.914
-"""Of the start line: distance of its middle from the first waypoint, and size along and across the road."""
+"""Distance of the start line's middle from the first waypoint, and its size along and across the road."""
 START_CHECKS = (2, 8)
 """Light and dark fields of the start line, along and across the road."""
 FIELD_M = 20.0
@@ -43,8 +43,8 @@ MATERIALS = (
     "start",
     "far_start",
 )
-"""What has a colour of its own: `far_dash` is that of the centre line where dashes run together, and so on; `wall_x` is
-that of the walls that face along the x axis, `start` that of the start line's dark fields."""
+"""Parts that have a colour of their own: `far_dash` is the centre line where dashes run together, and so on; `wall_x`
+are the walls that face along the x axis, `start` the start line's dark fields."""
 SKY, FIELD, ROAD, LINE, DASH, FAR_DASH, WALL_X, WALL_Y, KERB, FAR_KERB, START, FAR_START = range(
     len(MATERIALS)
 )

@@ -45,7 +45,7 @@ CAR = np.dtype(
     ],
     align=True,
 )
-"""What `tyre_forces` needs to know of a car."""
+"""Constants of a car that `tyre_forces` reads."""
 
 DRIVE = np.dtype(
     [
@@ -57,7 +57,7 @@ DRIVE = np.dtype(
         ("wheel_mps", "f8", 4),
     ]
 )
-"""What changes while a car drives: steering angle without trim, last command, acceleration, speeds of the rims."""
+"""State of a driving car: steering angle without trim, last command, acceleration, speeds of the rims."""
 
 Cars = NDArray[np.void]
 

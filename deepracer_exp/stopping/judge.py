@@ -1,4 +1,4 @@
-"""What a stopping rule says of a whole training, for its report.
+"""The decision of a stopping rule on a whole training, for its report.
 
 A run of ours is judged by the values of its own rule, the logs of others by `LOG_RULE` and `LOG_OVERFITTING`.
 """
@@ -43,7 +43,7 @@ class Convergence:
     """Since when nothing has grown."""
 
     iteration: int | None
-    """None: not converged."""
+    """Iteration at which it converged; None if it has not."""
     completion: float
     """Moving average at the end, per cent."""
     completion_before: float
@@ -95,10 +95,10 @@ def convergence(
 
 @dataclass(frozen=True, kw_only=True)
 class Overfitting:
-    """How the evaluations of a training went, and whether its rule calls that overfitting."""
+    """The evaluations of a training, and whether its rule calls them overfitting."""
 
     decision: Decision | None
-    """What the stopping rule says after the last iteration; None: no sign of overfitting."""
+    """Decision of the stopping rule after the last iteration; None without a sign of overfitting."""
     evaluated: str
     """`held-out evaluation` or `evaluation`."""
     best: float

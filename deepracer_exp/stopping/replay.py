@@ -1,4 +1,4 @@
-"""Where a stopping rule would have ended runs that continued."""
+"""Replays of a stopping rule: the iteration at which it would have ended runs that continued."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,11 +27,11 @@ class Replay:
     rule: str
     """The rule that was applied, as its overrides."""
     decision: Decision | None
-    """None: it would not have stopped the run."""
+    """The decision that would have ended the run; None if there was none."""
     iteration: int
     """The iteration after which the run would have ended; its last one without a decision."""
     iterations: int
-    """Of the whole run."""
+    """Number of iterations of the whole run."""
     env_steps: int
     saved_steps: int
     saved_s: float

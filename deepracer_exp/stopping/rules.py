@@ -42,7 +42,7 @@ class Decision:
     why: str
     """The rule's reason in words."""
     values: dict[str, float] = field(default_factory=dict)
-    """What was compared; entropy as a share, see `entropy_share`."""
+    """Values that were compared; entropy as a share, see `entropy_share`."""
     thresholds: dict[str, Any] = field(default_factory=dict)
     """The keys of the rule."""
     stopped_early: bool = False

@@ -1,4 +1,4 @@
-"""Which tracker records a run: `tracking.kind`, or a class of your own."""
+"""The tracker that records a run, by `tracking.kind` or as a class of your own."""
 
 import importlib.util
 from pathlib import Path

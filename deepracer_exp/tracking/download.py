@@ -35,7 +35,7 @@ _MODULE = "deepracer_exp.tracking.download"
 
 @dataclass(frozen=True)
 class Download:
-    """What is downloaded, from where."""
+    """A download: the files, and where they are."""
 
     uri: str
     """Address of the store, with the password of a database: it comes on standard input, which `ps` does not show."""

@@ -1,4 +1,4 @@
-"""What describes a run in MLflow besides its metrics: parameters, tags, descriptions, columns of the runs table."""
+"""The description of a run in MLflow besides its metrics: parameters, tags, descriptions, columns of the runs table."""
 
 import hashlib
 import json

@@ -39,7 +39,7 @@ class Registered:
     alias: str
     version: str
     run_dir: Path
-    """Where the run's folder was when it was registered."""
+    """The run's folder when it was registered."""
     checkpoint: str
     """Name of its folder."""
     sha256: str

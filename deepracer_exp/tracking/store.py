@@ -53,13 +53,13 @@ class Store:
     """An MLflow tracking store that a run can be recorded in."""
 
     uri: str = field(repr=False)
-    """Of a database, including its password: for MLflow only, never for a log."""
+    """Address of the store, with a database's password: for MLflow only, never for a log."""
     artifact_location: str | None
-    """Where new experiments store their files; None: the server decides."""
+    """Folder of the files of new experiments; None if the server decides."""
     user: str | None = None
-    """Of a server."""
+    """User name on a server."""
     password: str | None = field(default=None, repr=False)
-    """Of a server; None: MLFLOW_TRACKING_PASSWORD."""
+    """Password on a server; None for that of MLFLOW_TRACKING_PASSWORD."""
 
     @property
     def shown(self) -> str:

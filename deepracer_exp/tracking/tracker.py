@@ -6,7 +6,7 @@ from pathlib import Path
 from .tracking_file import Status, TrackedRun
 
 FINISH_S = 30.0
-"""How long the end of a run waits for its store."""
+"""Seconds for which the end of a run waits for its store."""
 
 
 class Tracker:

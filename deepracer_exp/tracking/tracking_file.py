@@ -33,7 +33,7 @@ class TrackedRun:
     run_id: str | None = None
     """MLflow's id of the run; None until MLflow has created it."""
     status: Status | None = None
-    """How the run ended; None while it is running, or if it was killed."""
+    """MLflow's status of the ended run; None while it is running, or if it was killed."""
     end_ms: int | None = None
     complete: bool = False
     """Whether the run has ended and the store has been given all of it."""

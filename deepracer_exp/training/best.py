@@ -1,4 +1,4 @@
-"""Which policy of a run is the best so far: by its evaluation, or, without evaluations, by its own episodes."""
+"""The best policy of a run so far, by its evaluation, or, without evaluations, by its own episodes."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,7 +10,7 @@ from deepracer_exp.evaluation.result import Evaluation, Rank
 from .metrics import NOT_EVALUATED, Finished, Ranking, eval_columns
 
 _DRIVING = "driving"
-"""What ranks a policy that is not evaluated: the training's own episodes."""
+"""The measure of a policy that is not evaluated: the training's own episodes."""
 
 
 class BestPolicy:

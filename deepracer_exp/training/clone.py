@@ -30,7 +30,7 @@ SLOWER = 0.1
 """A clone's learning rate over its parent's, where none is given: what racers do with a good model."""
 _OWN = ("run", "checkpoint")
 _AS_USUAL = ("report=true", "collector.mode=sync", "collector.processes=null", "collector.threads=0")
-"""How the clone of a sweep's trial runs: the trial itself had one core and no report, because others ran beside it."""
+"""Settings for the clone of a sweep's trial, which had one core and no report, because others ran beside it."""
 _ALLOWED = {
     "track": "the policy has to find its way on another road",
     "reward": "values learned for another reward are wrong at first",
@@ -40,7 +40,7 @@ _ALLOWED = {
 
 @dataclass(frozen=True)
 class Clone:
-    """What a clone is trained with."""
+    """Everything that a clone is trained with."""
 
     experiment: Experiment
     composition: Composition

@@ -83,21 +83,21 @@ _BY_IMPORTANCE = (
 
 @dataclass(frozen=True, kw_only=True)
 class RunHeader:
-    """What is being trained, by the names of its options."""
+    """Names of what is being trained."""
 
     name: str
     track: str
     track_labels: tuple[str, ...]
-    """What each of several tracks is called in the rows; empty with one track."""
+    """Labels of several tracks in the rows; empty with one track."""
     remembered: int
-    """How many of the last finished episodes `lap_share` looks at."""
+    """Number of the last finished episodes that `lap_share` counts."""
     reward: str
     network: str
     actions: str
     budget: str
     """The limits of the run, such as `3,000,000 steps`."""
     folder: str
-    """Where the results go."""
+    """Folder of the results."""
 
     def __str__(self) -> str:
         """Return the choices in one line."""

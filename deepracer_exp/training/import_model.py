@@ -42,10 +42,10 @@ _CHOSEN_HERE = ("sensor", "neural_network", "lidar_config")
 
 @dataclass(frozen=True)
 class Imported:
-    """What a model became."""
+    """The run that a model became, and remarks on it."""
 
     folder: Path
-    """The run's."""
+    """Folder of the run."""
     options: list[Path]
     """Files written to `./conf`."""
     notes: list[str]

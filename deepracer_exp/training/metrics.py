@@ -1,4 +1,4 @@
-"""What the cars achieve: episodes counted from the trace, and the figures of an iteration and of a run."""
+"""The achievements of the cars: episodes counted from the trace, and the figures of an iteration and of a run."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -48,7 +48,7 @@ class Finished:
 
 
 class Record:
-    """How episodes ended: how many, how many laps, the fastest, and the last ones."""
+    """Counts of finished episodes and laps, the fastest lap, and the last episodes."""
 
     def __init__(self, remembered: int):
         """Begin with nothing.

@@ -52,7 +52,7 @@ class TakenOver(Exception):  # noqa: N818 - reads as what it is at the raise sit
 
 @dataclass
 class TrainResult:
-    """How a training ended."""
+    """The outcome of a training."""
 
     ending: Ending
     exit_code: int
@@ -373,7 +373,7 @@ class Trainer:
 
     @property
     def usage(self) -> tuple[int, int, float]:
-        """What the budget counts: env steps, iterations and seconds."""
+        """Env steps, iterations and seconds used, which the budget counts."""
         return self.env_steps, self.iteration, self.wall_clock_s
 
     @property
