@@ -46,9 +46,10 @@ race: $(RACER)  ## train the default experiment until the car drives reliably
 	@echo "training: $(BIN)/deepracer-exp train stopping=reliable"
 	@$(BIN)/deepracer-exp train stopping=reliable
 
-# Two processes, with a file's tests in one of them: they share what the file trains.
+# Two processes, each with a half in the order of the files, which share what a folder trains, imports and starts; the
+# first that is done takes half of what is left of the other's.
 test: $(STAMP)  ## the tests, without the long ones
-	@$(BIN)/python -m pytest -q -m "not slow" -n 2 --dist loadfile
+	@$(BIN)/python -m pytest -q -m "not slow" -n 2 --dist worksteal
 
 test-long: $(STAMP)  ## the tests that take longer than ten seconds each, and those of drawn examples with new ones
 	@$(BIN)/python -m pytest -q -m "slow or hypothesis" --hypothesis-profile=new -n 2

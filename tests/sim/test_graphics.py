@@ -1,24 +1,87 @@
 """Physics needs no graphics library, whatever MUJOCO_GL says; only films do."""
 
+import json
 import os
 import subprocess
 import sys
 
 import pytest
 
-STEP = (
-    "import deepracer_exp.sim.batch; from deepracer_exp.evaluation.video import can_draw; print(can_draw())"
-)
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="names of libraries on Linux")
+
+LIBRARIES = ("bogus", "osmesa", "glfw", "egl", "disable", "")
+STEP = """
+import deepracer_exp.sim.batch
+from deepracer_exp.evaluation.video import can_draw
+print(can_draw())
+"""
+FILM = """
+from deepracer_exp.cli import main
+main(["evaluate", "x", "--video", "lap.mp4"])
+"""
+
+# What takes seconds to import is imported once, and a process forked for each call. MuJoCo is not among it: it reads
+# the variable when it is imported.
+FORKS = """
+import json, os, sys, traceback
+import numba, scipy, shapely, torch, torchrl
+assert "mujoco" not in sys.modules
+for number, (library, code) in enumerate(json.loads(sys.argv[1])):
+    if child := os.fork():
+        print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+        continue
+    for stream in (1, 2):
+        os.dup2(os.open(f"{number}-{stream}.txt", os.O_WRONLY | os.O_CREAT), stream)
+    os.environ["MUJOCO_GL"] = library
+    try:
+        exec(code, {"__name__": "__main__"})
+        code = 0
+    except SystemExit as ended:
+        code = ended.code
+    except BaseException:
+        traceback.print_exc()
+        code = 1
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+"""
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="names of libraries on Linux")
-@pytest.mark.parametrize("library", ["bogus", "osmesa", "glfw", "egl", "disable", ""])
-def test_a_graphics_library_that_cannot_be_used_stops_nothing_else(library):
-    env = {**os.environ, "MUJOCO_GL": library}
-    env.pop("DISPLAY", None)
-    done = subprocess.run([sys.executable, "-c", STEP], env=env, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.strip() in ("True", "False")
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory):
+    """Exit code, output and errors of a process for each library, and of a command that films with a bogus one."""
+    folder = tmp_path_factory.mktemp("graphics")
+    calls = [*((library, STEP) for library in LIBRARIES), ("bogus", FILM)]
+    env = {key: value for key, value in os.environ.items() if key != "DISPLAY"}
+    done = subprocess.run(
+        [sys.executable, "-c", FORKS, json.dumps(calls)],
+        cwd=folder, env=env, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    said = [
+        [(folder / f"{number}-{stream}.txt").read_text() for stream in (1, 2)] for number in range(len(calls))
+    ]
+    codes = map(int, done.stdout.split())
+    return dict(
+        zip(
+            (*LIBRARIES, "film"),
+            ((code, *texts) for code, texts in zip(codes, said, strict=True)),
+            strict=True,
+        )
+    )
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_a_graphics_library_that_cannot_be_used_stops_nothing_else(ended, library):
+    code, out, err = ended[library]
+    assert (code, err) == (0, "")
+    assert out.strip() in ("True", "False")
     if library in ("bogus", "glfw", "disable"):
-        assert done.stdout.strip() == "False"
-    assert done.stderr == ""
+        assert out.strip() == "False"
+
+
+def test_a_library_that_cannot_draw_is_one_line_before_anything_is_driven(ended):
+    code, _, err = ended["film"]
+    assert code == 2
+    assert err.startswith("deepracer-exp: --video: MuJoCo cannot draw with MUJOCO_GL=bogus here; accepted: ")
+    assert err.count("\n") == 1
