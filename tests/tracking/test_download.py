@@ -1,9 +1,14 @@
 """A promoted model where the folder of its run is not."""
 
+import contextlib
+import io
 import json
+import resource
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -29,6 +34,29 @@ def away(season, client) -> Path:
     return run
 
 
+@pytest.fixture
+def downloads_here(monkeypatch):
+    """Let the process that downloads be a call in this one: importing MLflow takes it seconds, each time."""
+
+    @contextlib.contextmanager
+    def running(command, **_):
+        def communicate(wanted: bytes, _: float):
+            said = io.StringIO()
+            monkeypatch.setattr(sys, "argv", command[-2:])
+            monkeypatch.setattr(sys, "stdin", io.StringIO(wanted.decode()))
+            with contextlib.redirect_stderr(said):
+                process.returncode = module._main()
+            return None, said.getvalue().encode()
+
+        process = SimpleNamespace(communicate=communicate)
+        yield process
+
+    monkeypatch.setattr(module, "running", running)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
 def files_of(client) -> Path:
     """Return the folder of the registered checkpoint in MLflow."""
     version = client.get_model_version_by_alias("season", "champion")
@@ -48,6 +76,7 @@ def test_a_promoted_model_is_downloaded_whole_once_and_as_it_was_registered(away
     assert [path.name for path in away.parent.iterdir()] == [away.name]
 
 
+@pytest.mark.usefixtures("downloads_here")
 def test_a_checkpoint_that_is_gone_from_its_run_is_downloaded_alone(season, client, away):
     run = season.run("1")
     shutil.rmtree(run / "checkpoints" / "000020")
@@ -57,6 +86,7 @@ def test_a_checkpoint_that_is_gone_from_its_run_is_downloaded_alone(season, clie
     assert (run / "config.yaml").read_text() == "own: true\n"
 
 
+@pytest.mark.usefixtures("downloads_here")
 @pytest.mark.parametrize(
     ("harm", "words"),
     [
