@@ -179,11 +179,7 @@ class Started:
     def wait_for_iterations(self, count: int = 1) -> None:
         """Wait until as many iterations are recorded."""
 
-        def recorded() -> bool:
-            files = list(self.cwd.glob("runs/*/*/metrics.jsonl"))
-            return bool(files) and files[0].read_text().count("\n") >= count
-
-        self.wait_for(recorded, f"{count} iterations")
+        self.wait_for(lambda: iterations(self.cwd) >= count, f"{count} iterations")
 
     def signal_group(self, signum: signal.Signals) -> None:
         """Send a signal to all processes of the session, as a terminal does."""
@@ -213,6 +209,12 @@ class Started:
             except psutil.NoSuchProcess:
                 continue
         self.popen.wait()
+
+
+def iterations(cwd: Path) -> int:
+    """Return how many iterations are recorded of the first run there."""
+    files = list(cwd.glob("runs/*/*/metrics.jsonl"))
+    return files[0].read_text().count("\n") if files else 0
 
 
 def command(*arguments: str) -> list[str]:
@@ -266,6 +268,7 @@ def refused(call: Callable[..., object], *arguments: object, **options: object) 
 
 
 IN_PROCESS = ("experiment=tiny", "tracking=off", "collector=in_process", "collector.threads=1")
+IN_WORKERS = ("experiment=tiny", "tracking=off", "collector=sync", "collector.processes=2")
 
 
 def call_in(cwd: Path, *arguments: str) -> Ended:

@@ -114,7 +114,7 @@ def assert_every_trial_is_accounted_for_once(cwd, storage=None, trials=TRIALS, i
 
 @pytest.mark.parametrize("seed", TIMES)
 def test_after_kill_9_of_the_only_worker_another_one_continues(sweep, tmp_path, seed):
-    running = sweep("sweep.workers=1", at_random=random.Random(seed))
+    running = sweep("sweep.workers=1", "algorithm.frames_per_iteration=256", at_random=random.Random(seed))
     for worker in running.workers():  # none after the last trial
         with contextlib.suppress(psutil.NoSuchProcess):
             worker.kill()

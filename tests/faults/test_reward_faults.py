@@ -1,11 +1,13 @@
 """A reward function that misbehaves while the cars drive: exit code 3, one line, the state on disk."""
 
 import json
+import multiprocessing
 
 import numpy as np
 import pytest
 
-from tests.conftest import IN_PROCESS
+from tests.conftest import IN_PROCESS, IN_WORKERS
+from tests.training.conftest import workers_start_early  # noqa: F401 - a fixture
 
 DEAF = """
 import itertools
@@ -154,13 +156,13 @@ def test_a_reward_that_fails_later_leaves_what_was_learned_before(train_here, re
     assert len(list((ended.folder / "trace").glob("*.parquet"))) == len(ended.metrics)
 
 
-def test_a_reward_that_raises_in_a_worker_ends_the_run_with_the_workers_own_words(start_training, reward):
-    training = start_training(reward("    return 1 / 0"), "collector=sync")
-    ended = training.end()
+@pytest.mark.usefixtures("workers_start_early")
+def test_a_reward_that_raises_in_a_worker_ends_the_run_with_the_workers_own_words(call, reward):
+    ended = call("train", *IN_WORKERS, reward("    return 1 / 0"))
     ended.assert_run_failed("raised ZeroDivisionError", "line 3 of")
     assert list((ended.folder / "faults").glob("worker-*.json"))
     assert list((ended.folder / "faults").glob("worker-*.npz"))
-    training.assert_nothing_left()
+    assert not multiprocessing.active_children()
 
 
 @pytest.mark.slow

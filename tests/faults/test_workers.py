@@ -1,9 +1,16 @@
 """Processes that are killed or stopped: the run ends as failed, says whom it lost, and leaves nothing behind."""
 
+import multiprocessing
 import signal
+import threading
 import time
 
+import psutil
 import pytest
+
+from tests.conftest import IN_WORKERS, iterations
+from tests.training.conftest import workers_start_early  # noqa: F401 - a fixture
+from tests.waiting import wait_until
 
 DEATHS_ALONE = ("collector.hang_timeout_s=600",)
 """The watchdog would end a worker later than the tests wait: what ends the run is that the death is noticed."""
@@ -21,13 +28,21 @@ def _lost(training, *words):
     return ended
 
 
-def test_a_killed_worker_never_ends_in_a_finished_run(start_training):
-    training = start_training("collector=sync", *DEATHS_ALONE)
-    training.wait_for_iterations(2)
-    victim = training.workers()[1]
-    victim.send_signal(signal.SIGKILL)
-    ended = _lost(training, "collector worker 1", f"(process {victim.pid})", "died by signal SIGKILL")
+@pytest.mark.usefixtures("workers_start_early")
+def test_a_killed_worker_never_ends_in_a_finished_run(call, tmp_path):
+    killed = []
+
+    def kill() -> None:
+        wait_until(lambda: iterations(tmp_path) >= 2, "second iteration")
+        workers = [psutil.Process(one.pid) for one in multiprocessing.active_children()]
+        killed.append(sorted(workers, key=lambda one: (one.create_time(), one.pid))[1])
+        killed[0].kill()
+
+    threading.Thread(target=kill).start()
+    ended = call("train", *IN_WORKERS, *DEATHS_ALONE, "budget.env_steps=100000000")
+    ended.assert_run_failed("collector worker 1", f"(process {killed[0].pid})", "died by signal SIGKILL")
     assert ended.summary["iteration"] == len(ended.metrics) >= 2
+    assert not multiprocessing.active_children()
 
 
 @pytest.mark.slow

@@ -18,6 +18,7 @@ TINY = (
     *("sweep", "experiment=tiny", "tracking=off", "collector.threads=1", "checkpoints.every=1"),
     *("episode.max_steps=60", "budget.env_steps=null", "budget.iterations=4", "sweep.protocol=three_trials"),
     *("sweep.workers=1", "sweep.rerank_laps=2"),
+    "algorithm.frames_per_iteration=256",
 )
 LR = "algorithm.lr=tag(log,interval(1e-5,1e-3))"
 SERVER = "postgresql+psycopg://me:secret@127.0.0.1:1/none"
@@ -57,10 +58,10 @@ def test_a_study_that_is_not_there_is_refused_before_the_sweep_starts(call):
 
 
 @pytest.fixture(scope="module")
-def swept(tmp_path_factory, run_at):
+def swept(tmp_path_factory, call_at, fork_server):
     """Return a folder in which a study of two trials was made."""
     folder = tmp_path_factory.mktemp("swept")
-    ended = run_at(folder, *TINY, "study=s", LR, "sweep.trials=2")
+    ended = call_at(folder, *TINY, "study=s", LR, "sweep.trials=2")
     assert ended.code == 0, ended.stderr
     return ended
 
