@@ -24,7 +24,7 @@ _SAME_START_M = 0.05
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Loss:
-    """What a lap loses."""
+    """The seconds that a lap loses to the fastest lap, by cause and sector."""
 
     fastest: FastestLap
     lap_time_s: float
@@ -60,13 +60,13 @@ def loss(view: LogView, folder: Path) -> Loss | None:
     lap = None if fastest is None else _lap_from_the_line(view, fastest)
     if question is None or fastest is None or lap is None:
         return None
-    own = pd.DataFrame({name: fastest.column(name) for name in ("time_s", "x_m", "y_m")})
+    driven = pd.DataFrame({name: fastest.column(name) for name in ("time_s", "x_m", "y_m")})
     sectors = sectors_of(question.track)
     return Loss(
         fastest=fastest,
         lap_time_s=float(lap["time_s"].iloc[-1]),
         by_sector=by_cause(
-            _in_sectors(lap, sectors, question.track), _in_sectors(own, sectors, question.track)
+            _in_sectors(lap, sectors, question.track), _in_sectors(driven, sectors, question.track)
         ),
     )
 
@@ -141,17 +141,17 @@ def loss_in_words(view: LogView, folder: Path) -> str:
         return f"none: {error}"
     if question is None or kept_lap(question) is None:
         return f"not searched yet: deepracer-exp analyze {folder.name} --fastest"
-    found = loss(view, folder)
-    return f"no complete {view.lap_word} from the start line" if found is None else lost_in_words(found)
+    lost = loss(view, folder)
+    return f"no complete {view.lap_word} from the start line" if lost is None else lost_in_words(lost)
 
 
-def lost_in_words(found: Loss) -> str:
+def lost_in_words(lost: Loss) -> str:
     """Return in a sentence what is lost, and where most."""
-    total, causes = found.lap_time_s - found.fastest.lap_time_s, found.by_sector.sum()
-    by_sector = found.by_sector.sum(axis=1)
+    total, causes = lost.lap_time_s - lost.fastest.lap_time_s, lost.by_sector.sum()
+    by_sector = lost.by_sector.sum(axis=1)
     parts = ", ".join(f"{causes[name]:+.2f} s {name}" for name in CAUSES)
-    of_car = f"{found.fastest.lap_time_s:.2f} s; bound {found.fastest.bound_s:.2f} s"
+    of_car = f"{lost.fastest.lap_time_s:.2f} s; bound {lost.fastest.bound_s:.2f} s"
     return (
-        f"{found.lap_time_s:.2f} s, {total:.2f} s more than the fastest lap of this car ({of_car}): {parts}; most in "
+        f"{lost.lap_time_s:.2f} s, {total:.2f} s more than the fastest lap of this car ({of_car}): {parts}; most in "
         f"{by_sector.idxmax()} ({by_sector.max():+.2f} s)"
     )

@@ -18,10 +18,10 @@ def value_text(value: Any, most: int = 48) -> str:
 def last_value(record: RunRecord, column: str) -> float | None:
     """Return a metric of the last iteration; of lap times, with several tracks, the mean of theirs if each has one."""
     last = record.rows[-1]
-    known = [value for key, value in last.items() if key.startswith(f"{column}/")]
-    if last.get(column) is not None or not known:
+    logged = [value for key, value in last.items() if key.startswith(f"{column}/")]
+    if last.get(column) is not None or not logged:
         return last.get(column)
-    return None if None in known else sum(known) / len(known)
+    return None if None in logged else sum(logged) / len(logged)
 
 
 RESULTS: tuple[tuple[str, str, str, int], ...] = (
@@ -70,12 +70,12 @@ def results(records: Sequence[RunRecord]) -> list[tuple[str, list[str], int | No
     """
     lines, found_of = [], [_values(record) for record in records]
     for name, key, form, better in RESULTS:
-        values = [found.get(key) for found in found_of]
-        if all(found is None for found in values):
+        values = [result.get(key) for result in found_of]
+        if all(value is None for value in values):
             continue
-        known = [found for found in values if found is not None]
+        measured = [value for value in values if value is not None]
         best = None
-        if better and len(known) > 1 and min(known) != max(known):
-            best = values.index(max(known) if better > 0 else min(known))
-        lines.append((name, [NOTHING if found is None else form.format(found) for found in values], best))
+        if better and len(measured) > 1 and min(measured) != max(measured):
+            best = values.index(max(measured) if better > 0 else min(measured))
+        lines.append((name, [NOTHING if value is None else form.format(value) for value in values], best))
     return lines

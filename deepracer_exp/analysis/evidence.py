@@ -1,4 +1,4 @@
-"""What runs over several seeds say: interquartile means, bootstrap intervals, and whether two groups really differ.
+"""Evidence of several seeds: interquartile means, bootstrap intervals, and whether two groups really differ.
 
 Definitions: Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical Precipice (2021). Scores come in
 strata: one array a track, one value a seed. Seeds are resampled within their track, never from one track to another.
@@ -76,19 +76,19 @@ def iqm_band(curves: Values) -> tuple[Values, Values, Values]:
     """
     middle, low, high = np.full((3, curves.shape[1]), np.nan)
     for column, values in enumerate(curves.T):
-        known = values[~np.isnan(values)]
-        if len(known) < max(1.0, len(values) / 2):
+        measured = values[~np.isnan(values)]
+        if len(measured) < max(1.0, len(values) / 2):
             continue
-        found = estimate([known])
-        middle[column] = found.iqm
-        if found.interval is not None:
-            low[column], high[column] = found.interval
+        band = estimate([measured])
+        middle[column] = band.iqm
+        if band.interval is not None:
+            low[column], high[column] = band.interval
     return middle, low, high
 
 
 @dataclass(frozen=True)
 class Difference:
-    """How the scores of a group of runs differ from those of another."""
+    """The difference between the scores of two groups of runs."""
 
     iqm: float | None
     """Interquartile mean minus the other's; None where one of them is infinite."""
@@ -137,7 +137,9 @@ def difference(one: Strata, other: Strata, lower_is_better: bool) -> Difference:
     Raises:
         ValueError: a track has no score.
     """
-    cells = [(tuple(np.sort(own)), tuple(np.sort(others))) for own, others in zip(one, other, strict=True)]
+    cells = [
+        (tuple(np.sort(values)), tuple(np.sort(others))) for values, others in zip(one, other, strict=True)
+    ]
     pairs, turned = sorted(cells), sorted(cell[::-1] for cell in cells)
     if turned < pairs:  # which group is named first decides nothing but signs
         return difference(other, one, lower_is_better).reversed()
@@ -166,8 +168,8 @@ def difference(one: Strata, other: Strata, lower_is_better: bool) -> Difference:
 def _improvement(ours: Strata, theirs: Strata, lower_is_better: bool) -> Values:
     """Return the probability of improvement of each resample; the scores of a track are (resamples, seeds)."""
     of_tracks = []
-    for own, other in zip(ours, theirs, strict=True):
-        a, b = own[:, :, None], other[:, None, :]
+    for ours_here, other in zip(ours, theirs, strict=True):
+        a, b = ours_here[:, :, None], other[:, None, :]
         better = a < b if lower_is_better else a > b
         of_tracks.append((better + 0.5 * (a == b)).mean(axis=(1, 2)))
     return np.asarray(np.mean(of_tracks, axis=0))

@@ -50,7 +50,7 @@ class Finding:
 
     rule: str
     sentence: str
-    """In plain words, one to three sentences."""
+    """The finding in plain words, one to three sentences."""
     values: Mapping[str, float | int | str] = field(default_factory=dict)
     """The numbers that were compared."""
     thresholds: Mapping[str, float | int] = field(default_factory=dict)
@@ -63,22 +63,22 @@ class Finding:
 
 def findings(view: LogView, target_s: float | None = None) -> list[Finding]:
     """Apply all rules to a log, the most important findings first; `target_s`: the lap time wanted, if there is one."""
-    found, overfits = list[Finding | None](), None
+    results, overfits = list[Finding | None](), None
     if view.trained:
         overfits = _overfits(view)
-        found += [_converged(view, overfits), _submit(view), _laps_slower(view)]
-    found += [_chance(view, target_s), _time_lost(view), _crashes(view), *_runs_off(view)]
-    found += [_zigzag(view), overfits]
-    return [one for one in found if one is not None]
+        results += [_converged(view, overfits), _submit(view), _laps_slower(view)]
+    results += [_chance(view, target_s), _time_lost(view), _crashes(view), *_runs_off(view)]
+    results += [_zigzag(view), overfits]
+    return [finding for finding in results if finding is not None]
 
 
 def _converged(view: LogView, overfits: Finding | None) -> Finding:
     decision = view.decision
     if decision is not None:
         return _decided(decision)
-    found = convergence(view.judged, view.action_count, view.stopping)
+    converged = convergence(view.judged, view.action_count, view.stopping)
     rule = convergence_rule(view.stopping)
-    if found is None:
+    if converged is None:
         driven = int((view.judged["episodes"] > 0).sum())
         sentence = (
             f"Too short to say whether the training has converged: {_of(driven, view)}, and at least "
@@ -87,36 +87,36 @@ def _converged(view: LogView, overfits: Finding | None) -> Finding:
         return Finding("converged", sentence, {"iterations": driven})
     keep = "" if overfits is not None and overfits.values["overfits"] else " Keep training."
     values: _Numbers = {
-        "completion": found.completion,
-        "completion_before": found.completion_before,
-        "completion_best": found.completion_best,
-        "patience": found.patience,
+        "completion": converged.completion,
+        "completion_before": converged.completion_before,
+        "completion_best": converged.completion_best,
+        "patience": converged.patience,
     }
-    if found.entropy_change is not None:
-        values["entropy_change"] = found.entropy_change
-    if found.iteration is not None:
-        values["iteration"] = found.iteration
+    if converged.entropy_change is not None:
+        values["entropy_change"] = converged.entropy_change
+    if converged.iteration is not None:
+        values["iteration"] = converged.iteration
         sentence = (
-            f"Converged at iteration {found.iteration}: since then completion ({found.completion:.0f}%), reward and "
-            "complete laps have not grown."
+            f"Converged at iteration {converged.iteration}: since then completion ({converged.completion:.0f}%), "
+            "reward and complete laps have not grown."
         )
-        if found.completion < POOR:
+        if converged.completion < POOR:
             sentence += (
                 " That is far from a lap: change reward, action space or learning rate, do not train longer."
             )
-    elif found.completion < found.completion_best - rule.completion_near:
+    elif converged.completion < converged.completion_best - rule.completion_near:
         sentence = (
-            f"Not converged: completion fell back from {found.completion_best:.0f} to {found.completion:.0f}%. "
+            f"Not converged: completion fell back from {converged.completion_best:.0f} to {converged.completion:.0f}%. "
             f"Lower the learning rate, or take {_instead(view)}."
         )
-    elif found.completion > found.completion_before + rule.completion_gain:
+    elif converged.completion > converged.completion_before + rule.completion_gain:
         sentence = (
-            f"Not converged yet: completion grew from {found.completion_before:.0f} to {found.completion:.0f}% in "
-            f"the last {_of(found.patience, view)}.{keep}"
+            f"Not converged yet: completion grew from {converged.completion_before:.0f} to {converged.completion:.0f}% "
+            f"in the last {_of(converged.patience, view)}.{keep}"
         )
     else:
-        what = "reward or complete laps still grow" if found.entropy_flat else "the entropy still changes"
-        sentence = f"Not converged yet: completion is {found.completion:.0f}%, but {what}.{keep}"
+        what = "reward or complete laps still grow" if converged.entropy_flat else "the entropy still changes"
+        sentence = f"Not converged yet: completion is {converged.completion:.0f}%, but {what}.{keep}"
     thresholds = {
         "completion_gain": rule.completion_gain,
         "reward_gain": rule.return_gain,
@@ -260,7 +260,7 @@ def _chance(view: LogView, target_s: float | None) -> Finding | None:
     driven = count(laps, f"complete {view.lap_word}")
     values: _Numbers = {"laps": laps, "best_s": best_s, "mean_s": mean_s, "complete": complete, "sd_s": sd_s}
     if target_s is None:
-        p25_s, median_s = (float(one) for one in np.quantile(laps_s, [0.25, 0.5]))
+        p25_s, median_s = (float(quantile) for quantile in np.quantile(laps_s, [0.25, 0.5]))
         sentence = (
             f"Half of the {driven} {when} took at most {median_s:.2f} s, a quarter at most "
             f"{p25_s:.2f} s; the fastest took {best_s:.2f} s. {share}"
@@ -352,29 +352,31 @@ def _runs_off(view: LogView) -> list[Finding]:
         return [Finding("runs_off", f"The car {often} {when}.", {"times": times}, thresholds)]
     sectors = sectors_of(view.course) if view.course is not None else []
     where = [
-        f"at waypoint {one.waypoint}{_in(sectors, one)} to the {one.side} "
-        f"({one.count} of {one.passes} passes: a risk of {_share(one.low)} to {_share(one.high)})"
-        for one in places
+        f"at waypoint {place.waypoint}{_in(sectors, place)} to the {place.side} "
+        f"({place.count} of {place.passes} passes: a risk of {_share(place.low)} to {_share(place.high)})"
+        for place in places
     ]
     sentence = f"The car runs off most often {', then '.join(where)}, counted {when}."
-    values = {f"risk, waypoint {one.waypoint}": one.count / one.passes for one in places}
-    values |= {f"times, waypoint {one.waypoint}": one.count for one in places}
+    values = {f"risk, waypoint {place.waypoint}": place.count / place.passes for place in places}
+    values |= {f"times, waypoint {place.waypoint}": place.count for place in places}
     return [Finding("runs_off", sentence, values, thresholds), _steering(places)]
 
 
 def _steering(places: Sequence[OffTrackPlace]) -> Finding:
     # A mistake made at several places is mentioned once.
-    at: dict[str, list[str]] = {}
-    for one in places:
-        mistake = JUDGEMENTS[one.judgement] if one.judgement else "its mistakes vary"
-        at.setdefault(mistake, []).append(str(one.waypoint))
+    waypoints: dict[str, list[str]] = {}
+    for place in places:
+        mistake = JUDGEMENTS[place.judgement] if place.judgement else "its mistakes vary"
+        waypoints.setdefault(mistake, []).append(str(place.waypoint))
     words = []
-    for mistake, some in at.items():
+    for mistake, some in waypoints.items():
         *first, last = some
         where = f"waypoints {', '.join(first)} and {last}" if first else f"waypoint {last}"
         words.append(f"at {where} {mistake}")
     values = {
-        f"{name}, waypoint {one.waypoint}": times for one in places for name, times in one.judgements.items()
+        f"{name}, waypoint {place.waypoint}": times
+        for place in places
+        for name, times in place.judgements.items()
     }
     thresholds = {"unusual": off_track.UNUSUAL, "slide_deg": off_track.SLIDE_DEG}
     thresholds |= {"steers_deg": off_track.STEERS_DEG}
@@ -396,35 +398,35 @@ def _in(sectors: Sequence[Sector], place: OffTrackPlace) -> str:
 
 def _overfits(view: LogView) -> Finding | None:
     decision = view.decision
-    found = overfitting(view.judged, view.stopping)
-    if found is None or (decision is not None and decision["rule"] == "overfitting"):  # reported already
+    judged = overfitting(view.judged, view.stopping)
+    if judged is None or (decision is not None and decision["rule"] == "overfitting"):  # reported already
         return None
-    values: _Numbers = {"best": found.best, "now": found.now, "best_iteration": found.best_iteration}
-    values["overfits"] = int(found.decision is not None)
+    values: _Numbers = {"best": judged.best, "now": judged.now, "best_iteration": judged.best_iteration}
+    values["overfits"] = int(judged.decision is not None)
     sentence = (
-        f"No sign of overfitting: the mean completion of the last three {found.evaluated}s is {found.now:.0f}% "
-        f"(best three in a row: {found.best:.0f}%)."
+        f"No sign of overfitting: the mean completion of the last three {judged.evaluated}s is {judged.now:.0f}% "
+        f"(best three in a row: {judged.best:.0f}%)."
     )
-    if found.decision is not None:
+    if judged.decision is not None:
         sentence = (
-            f"It overfits: the mean completion of three {found.evaluated}s in a row fell from {found.best:.0f}% "
-            f"around iteration {found.best_iteration} to {found.now:.0f}% while the reward of the training holds. Take "
-            f"{_instead(view)}."
+            f"It overfits: the mean completion of three {judged.evaluated}s in a row fell from {judged.best:.0f}% "
+            f"around iteration {judged.best_iteration} to {judged.now:.0f}% while the reward of the training holds. "
+            f"Take {_instead(view)}."
         )
-        values |= found.decision.values
-    thresholds = {"held_out_drop": found.rule.held_out_drop, "return_drop": found.rule.return_drop}
-    return Finding("overfits", sentence, values, thresholds | {"patience": found.rule.patience})
+        values |= judged.decision.values
+    thresholds = {"held_out_drop": judged.rule.held_out_drop, "return_drop": judged.rule.return_drop}
+    return Finding("overfits", sentence, values, thresholds | {"patience": judged.rule.patience})
 
 
 def _laps_slower(view: LogView) -> Finding | None:
     decision = view.decision
-    found = slower_laps(view.judged)
-    if found is None or (decision is not None and decision["rule"] == "laps_slower"):  # reported already
+    slower = slower_laps(view.judged)
+    if slower is None or (decision is not None and decision["rule"] == "laps_slower"):  # reported already
         return None
-    values: _Numbers = {"iteration": found.since, "fastest_s": found.fastest_s, "now_s": found.now_s}
-    values |= {"return_then": found.return_then, "return_now": found.return_now}
+    values: _Numbers = {"iteration": slower.since, "fastest_s": slower.fastest_s, "now_s": slower.now_s}
+    values |= {"return_then": slower.return_then, "return_now": slower.return_now}
     thresholds = {"slower": SLOWER, "chance": CHANCE, "least_lap_times": LEAST_TIMES}
-    return Finding("laps_slower", f"{found} Take {_instead(view)}.", values, thresholds)
+    return Finding("laps_slower", f"{slower} Take {_instead(view)}.", values, thresholds)
 
 
 def _instead(view: LogView) -> str:

@@ -38,7 +38,7 @@ def group_curve(group: RunGroup, column: str) -> pd.DataFrame:
     if not len(steps):
         return pd.DataFrame(columns=["env_steps", "iqm", "low", "high", "runs"])
     grid = steps[subsample(len(steps), _PLACES)]
-    values = np.stack([_held(*own, grid) for own in curves])
+    values = np.stack([_held(*points, grid) for points in curves])
     middle, low, high = iqm_band(values)
     runs = (~np.isnan(values)).sum(axis=0)
     return pd.DataFrame(
@@ -57,18 +57,18 @@ def _known(record: RunRecord, column: str) -> tuple[Values, Values]:
     # Not every iteration ends an episode on every track.
     values = rows[columns].astype(float)
     values = values if column.startswith("eval_") else values.ffill().rolling(3, min_periods=1).mean()
-    found = values.mean(axis=1, skipna=False).to_numpy(np.float64)
+    means = values.mean(axis=1, skipna=False).to_numpy(np.float64)
     if column.startswith("eval_") and column.endswith("_s"):
-        found = np.where(np.isnan(found), np.inf, found)
-    there = ~np.isnan(found)
-    return rows["env_steps"].to_numpy(np.float64)[there], found[there]
+        means = np.where(np.isnan(means), np.inf, means)
+    there = ~np.isnan(means)
+    return rows["env_steps"].to_numpy(np.float64)[there], means[there]
 
 
 def _held(steps: Values, values: Values, grid: Values) -> Values:
     if not len(steps):
         return np.full(len(grid), np.nan)
-    at = np.searchsorted(steps, grid, "right") - 1
-    return np.where((at >= 0) & (grid <= steps[-1]), values[np.maximum(at, 0)], np.nan)
+    last = np.searchsorted(steps, grid, "right") - 1
+    return np.where((last >= 0) & (grid <= steps[-1]), values[np.maximum(last, 0)], np.nan)
 
 
 def curves_table(groups: Sequence[RunGroup]) -> pd.DataFrame:

@@ -1,4 +1,4 @@
-"""What groups of runs scored and how they differ, as tables, sentences and JSON."""
+"""The scores of groups of runs and their differences, as tables, sentences and JSON."""
 
 import json
 import math
@@ -20,35 +20,35 @@ def scored(groups: Sequence[RunGroup]) -> Table:
     rows = []
     for group in groups:
         for course in group.courses:
-            own = group.on(course)
-            figures = [figure_text(figure, own.estimate(figure)) for figure in FORMS]
-            rows.append((group.name, *[course] * several, str(len(own.records)), *figures))
+            runs = group.on(course)
+            figures = [figure_text(figure, runs.estimate(figure)) for figure in FORMS]
+            rows.append((group.name, *[course] * several, str(len(runs.records)), *figures))
     heads = ("group", *["track"] * several, "runs", *(name for name, _, _ in FORMS.values()))
     return Table(heads, tuple(rows), 1 + several)
 
 
-def figure_text(figure: str, found: Estimate | None) -> str:
+def figure_text(figure: str, estimate: Estimate | None) -> str:
     """Return an estimate as text: ``8.02 (7.91 to 8.20)``."""
-    if found is None:
+    if estimate is None:
         return NONE
     form = FORMS[figure][1]
-    middle = form.format(found.iqm) if math.isfinite(found.iqm) else "no lap"
-    return middle if found.interval is None else f"{middle} ({_ends(form, found.interval)})"
+    middle = form.format(estimate.iqm) if math.isfinite(estimate.iqm) else "no lap"
+    return middle if estimate.interval is None else f"{middle} ({_ends(form, estimate.interval)})"
 
 
 def _ends(form: str, interval: Interval) -> str:
     return " to ".join(form.format(end) if math.isfinite(end) else "no lap" for end in interval)
 
 
-def differences_table(found: Sequence[Comparison]) -> Table:
+def differences_table(comparisons: Sequence[Comparison]) -> Table:
     """Return comparisons as texts."""
-    several = len({one.course for one in found}) > 1
+    several = len({comparison.course for comparison in comparisons}) > 1
     rows = []
-    for one in found:
-        name, form, _ = FORMS[one.figure]
-        if one.course is None:
+    for comparison in comparisons:
+        name, form, _ = FORMS[comparison.figure]
+        if comparison.course is None:
             name, form = f"{name.partition(',')[0]}, % of the track's mean", "{:.1f}"
-        apart, chance = one.difference, one.difference.probability_interval
+        apart, chance = comparison.difference, comparison.difference.probability_interval
         signed = form.replace(":", ":+")
         change = NONE if apart.iqm is None else signed.format(apart.iqm)
         if apart.interval is not None:
@@ -56,35 +56,35 @@ def differences_table(found: Sequence[Comparison]) -> Table:
         better = f"{apart.probability:.0%}" + (
             "" if chance is None else f" ({chance[0]:.0%} to {chance[1]:.0%})"
         )
-        track = [one.course or "all tracks"] * several
-        rows.append((one.group, *track, name, one.verdict, change, better))
+        track = [comparison.course or "all tracks"] * several
+        rows.append((comparison.group, *track, name, comparison.verdict, change, better))
     heads = ("group", *["track"] * several, "figure", "verdict", "difference", "probability of improvement")
     return Table(heads, tuple(rows), 3 + several)
 
 
-def sentences(groups: Sequence[RunGroup], found: Sequence[Comparison]) -> list[str]:
+def sentences(groups: Sequence[RunGroup], comparisons: Sequence[Comparison]) -> list[str]:
     """Return what the tables say, in sentences: the verdict on the lap first."""
     alone = len(courses_of(groups)) == 1
-    told = [
-        f"{one.group} against {one.other}, lap of the evaluated policy: {one.verdict}."
-        for one in found
-        if one.figure == COMPARED[0] and (one.course is None or alone)
+    lines = [
+        f"{comparison.group} against {comparison.other}, lap of the evaluated policy: {comparison.verdict}."
+        for comparison in comparisons
+        if comparison.figure == COMPARED[0] and (comparison.course is None or alone)
     ]
     results = [result_of(record.summary) for group in groups for record in group.records]
     lacking = sum(result is None or not result.evaluated for result in results)
     if lacking:
-        told.append(f"{count(lacking, 'run')} without an evaluation, or not ended: left out of the figures.")
+        lines.append(f"{count(lacking, 'run')} without an evaluation, or not ended: left out of the figures.")
     tests = {
-        json.dumps({**(one.config.get("evaluation") or {}), "tracks": None})
+        json.dumps({**(record.config.get("evaluation") or {}), "tracks": None})
         for group in groups
-        for one in group.records
+        for record in group.records
     }
     if len(tests) > 1:
-        told.append("The runs were evaluated under different conditions: their figures do not compare.")
-    return told
+        lines.append("The runs were evaluated under different conditions: their figures do not compare.")
+    return lines
 
 
-def groups_as_json(groups: Sequence[RunGroup], found: Sequence[Comparison]) -> dict[str, Any]:
+def groups_as_json(groups: Sequence[RunGroup], comparisons: Sequence[Comparison]) -> dict[str, Any]:
     """Return everything that is compared, JSON types; infinite seconds, of laps never completed, are null."""
     curves = curves_table(groups)
     return {
@@ -100,17 +100,17 @@ def groups_as_json(groups: Sequence[RunGroup], found: Sequence[Comparison]) -> d
         ],
         "differences": [
             {
-                "group": one.group,
-                "other": one.other,
-                "track": one.course,
-                "figure": one.figure,
-                "difference": one.difference.iqm,
-                "interval": one.difference.interval,
-                "probability_of_improvement": one.difference.probability,
-                "probability_interval": one.difference.probability_interval,
-                "verdict": one.verdict,
+                "group": comparison.group,
+                "other": comparison.other,
+                "track": comparison.course,
+                "figure": comparison.figure,
+                "difference": comparison.difference.iqm,
+                "interval": comparison.difference.interval,
+                "probability_of_improvement": comparison.difference.probability,
+                "probability_interval": comparison.difference.probability_interval,
+                "verdict": comparison.verdict,
             }
-            for one in found
+            for comparison in comparisons
         ],
         "curves": [
             {
@@ -122,8 +122,8 @@ def groups_as_json(groups: Sequence[RunGroup], found: Sequence[Comparison]) -> d
     }
 
 
-def _estimate_json(found: Estimate | None) -> dict[str, Any] | None:
-    if found is None:
+def _estimate_json(score: Estimate | None) -> dict[str, Any] | None:
+    if score is None:
         return None
-    ends = None if found.interval is None else [end if math.isfinite(end) else None for end in found.interval]
-    return {"iqm": found.iqm if math.isfinite(found.iqm) else None, "interval": ends, "runs": found.seeds}
+    ends = None if score.interval is None else [end if math.isfinite(end) else None for end in score.interval]
+    return {"iqm": score.iqm if math.isfinite(score.iqm) else None, "interval": ends, "runs": score.seeds}

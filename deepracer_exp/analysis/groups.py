@@ -42,7 +42,7 @@ class RunGroup:
 
     def on(self, course: str) -> "RunGroup":
         """Return its runs on one track."""
-        return RunGroup(self.name, tuple(one for one in self.records if course_of(one) == course))
+        return RunGroup(self.name, tuple(record for record in self.records if course_of(record) == course))
 
     def scores(self, figure: str) -> Values:
         """Return a figure of the best checkpoints, one of FIGURES; infinity where a lap was never completed.
@@ -56,8 +56,8 @@ class RunGroup:
             for result in results
             if result is not None and result.evaluated
         ]
-        known = np.array(values, np.float64)
-        return known[~np.isnan(known)]
+        numbers = np.array(values, np.float64)
+        return numbers[~np.isnan(numbers)]
 
     def estimate(self, figure: str) -> Estimate | None:
         """Return the interquartile mean of a figure on the tracks of the group together; None without a score."""
@@ -84,23 +84,23 @@ def group_runs(named: Iterable[tuple[str | None, RunRecord]]) -> list[RunGroup]:
     """
     pairs = list(named)
     records = [record for _, record in pairs]
-    found = run_differences(records)
+    differences = run_differences(records)
     evaluated_alike = len({course_of(record) for record in records}) == 1
     deciding = [
         key
-        for key in found
+        for key in differences
         if key not in _NOT_OF_GROUP and (evaluated_alike or key.partition(".")[0] != "track")
     ]
     members: dict[str, list[int]] = {}
     for number, (name, _) in enumerate(pairs):
-        settings = json.dumps([found[key][number] for key in deciding])
+        settings = json.dumps([differences[key][number] for key in deciding])
         members.setdefault(f"={name}" if name is not None else settings, []).append(number)
     names = {key: pairs[numbers[0]][0] for key, numbers in members.items()}
     open_groups = {key: numbers[0] for key, numbers in members.items() if names[key] is None}
     labels = _labels([records[number] for number in open_groups.values()])
     if len(set(labels)) < len(labels):
         labels = [
-            ", ".join(f"{key}={value_text(found[key][number], 24)}" for key in deciding[:_MOST_WORDS])
+            ", ".join(f"{key}={value_text(differences[key][number], 24)}" for key in deciding[:_MOST_WORDS])
             for number in open_groups.values()
         ]
     for number, (key, label) in enumerate(zip(open_groups, labels, strict=True), 1):
@@ -120,9 +120,11 @@ def _labels(records: Sequence[RunRecord]) -> list[str]:
         return [str(record.config.get("name") or record.name) for record in records]
     labels = []
     for record, words in zip(records, chosen, strict=True):
-        own = [f"{key}={words[key] if key in words else _default(record.config, key)}" for key in differing]
-        more = [f"and {len(own) - _MOST_WORDS} more"] * (len(own) > _MOST_WORDS)
-        labels.append(" ".join([*own[:_MOST_WORDS], *more]))
+        settings = [
+            f"{key}={words[key] if key in words else _default(record.config, key)}" for key in differing
+        ]
+        more = [f"and {len(settings) - _MOST_WORDS} more"] * (len(settings) > _MOST_WORDS)
+        labels.append(" ".join([*settings[:_MOST_WORDS], *more]))
     return labels
 
 
@@ -160,7 +162,7 @@ class Comparison:
     group: str
     other: str
     course: str | None
-    """None: all tracks that both have, each in shares of its own mean."""
+    """The track; None for all tracks that both have, each in shares of its mean."""
     figure: str
     difference: Difference
 
@@ -173,7 +175,7 @@ class Comparison:
 
 def compared(groups: Sequence[RunGroup]) -> list[Comparison]:
     """Hold each group against the first: on each track that both have, and on all of these together."""
-    found: list[Comparison] = []
+    comparisons: list[Comparison] = []
     first, *others = groups
     for other in others:
         common = [course for course in first.courses if course in other.courses]
@@ -184,10 +186,12 @@ def compared(groups: Sequence[RunGroup]) -> list[Comparison]:
                 if len(pair[0]) and len(pair[1]):
                     cells.append((course, pair))
             for course, pair in cells:
-                found.append(_comparison(other, first, course, figure, [pair]))
+                comparisons.append(_comparison(other, first, course, figure, [pair]))
             if len(cells) > 1:
-                found.append(_comparison(other, first, None, figure, [_relative(pair) for _, pair in cells]))
-    return found
+                comparisons.append(
+                    _comparison(other, first, None, figure, [_relative(pair) for _, pair in cells])
+                )
+    return comparisons
 
 
 def _comparison(

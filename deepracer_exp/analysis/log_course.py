@@ -28,7 +28,7 @@ _LENGTH_NEAR = 0.01
 _INSIDE = 0.95
 """Share of the rows that must be on or just beside the road."""
 _BESIDE_M = 0.3
-"""How far beside the road a car may be before its episode ends."""
+"""Metres beside the road at which a car's episode ends."""
 _MISJUDGED = 0.02
 """Share of the rows whose wheels may be on the other side of the borders than logged: on the right world at most half a
 per cent (rounding), on one of another width four to ten."""
@@ -52,12 +52,12 @@ def find_courses(recording: Recording) -> tuple[dict[str, Track], tuple[LogProbl
     Returns:
         The courses by name, and those that were not recognised, or not for certain, with the reason.
     """
-    own: Mapping[str, TrackConfig] = {}
+    configs: Mapping[str, TrackConfig] = {}
     problems: list[LogProblem] = []
     for file in recording.files:
         if file.name == CONFIG:
             try:
-                own = parse_experiment(read_config(file.parent)).tracks
+                configs = parse_experiment(read_config(file.parent)).tracks
             except BadInput as error:
                 problems.append(LogProblem(str(file), None, str(error)))
             break
@@ -68,8 +68,8 @@ def find_courses(recording: Recording) -> tuple[dict[str, Track], tuple[LogProbl
         sample = rows.iloc[:: max(1, len(rows) // _SAMPLE)]
         logged = name or recording.track or ""
         try:
-            if logged in own:
-                both = [Track.from_config(own[logged], reversed=back) for back in (False, True)]
+            if logged in configs:
+                both = [Track.from_config(configs[logged], reversed=back) for back in (False, True)]
             elif (world := _recognised(logged, sample)) is not None:
                 both = [world_track(world.name, back) for back in (False, True)]
                 if world.misjudged > _MISJUDGED and world.name != find_world(logged):
@@ -114,15 +114,15 @@ def _recognised(logged: str, sample: pd.DataFrame) -> _Recognised | None:
     the names they had.
     """
     waypoint = sample["closest_waypoint"].to_numpy(np.intp)
-    known = np.isfinite(sample[["X", "Y", "yaw"]].to_numpy(np.float64)).all(axis=1) & (waypoint >= 0)
-    sample, waypoint = sample[known], waypoint[known]
+    usable = np.isfinite(sample[["X", "Y", "yaw"]].to_numpy(np.float64)).all(axis=1) & (waypoint >= 0)
+    sample, waypoint = sample[usable], waypoint[usable]
     if not len(sample):
         return None
     points = sample[["X", "Y"]].to_numpy(np.float64)
     length_m = float(sample["track_len"].median())
     away_m: dict[str, float] = {}
-    for one in recognise(points, waypoint):
-        away_m.setdefault(one.name, one.distance_m)
+    for match in recognise(points, waypoint):
+        away_m.setdefault(match.name, match.distance_m)
     named, car = find_world(logged), compose_option("car", "deepracer", CarConfig)
     ranked: list[tuple[tuple[bool, float, bool, float], _Recognised]] = []
     for name in worlds():
@@ -133,7 +133,7 @@ def _recognised(logged: str, sample: pd.DataFrame) -> _Recognised | None:
         rank = share > _MISJUDGED, round(away_m.get(name, NEAR_M), 3), name != named, share
         ranked.append((rank, _Recognised(name, share)))
     # Of equals, which differ in their floors only, the first one will do.
-    return min(ranked, key=lambda one: one[0])[1] if ranked else None
+    return min(ranked, key=lambda entry: entry[0])[1] if ranked else None
 
 
 def _misjudged(track: Track, sample: pd.DataFrame, car: CarConfig) -> float:
@@ -186,23 +186,25 @@ def numbered_as_logged(course: Track, steps: pd.DataFrame) -> Track:
     """
     sample = steps.iloc[:: max(1, len(steps) // (10 * _SAMPLE))]
     waypoint = sample["closest_waypoint"].to_numpy(np.intp)
-    found = course.project(sample[["X", "Y"]].to_numpy(np.float64))
-    if np.mean((waypoint == found.previous) | (waypoint == found.next)) >= _SAME_NUMBERS:
+    projected = course.project(sample[["X", "Y"]].to_numpy(np.float64))
+    if np.mean((waypoint == projected.previous) | (waypoint == projected.next)) >= _SAME_NUMBERS:
         return course
     # The first waypoint of a closed course is at 0 and at 1, so the mean is taken on the circle.
-    turn = pd.Series(np.exp(2j * np.pi * found.ndist)).groupby(waypoint).sum()
-    known = turn.index.to_numpy()
+    turn = pd.Series(np.exp(2j * np.pi * projected.ndist)).groupby(waypoint).sum()
+    logged = turn.index.to_numpy()
     place = np.unwrap(np.angle(turn) / (2 * np.pi), period=1.0)
-    if len(known) < 2 or (np.diff(place) <= 0).any() or place[-1] - place[0] >= 1.0:
+    if len(logged) < 2 or (np.diff(place) <= 0).any() or place[-1] - place[0] >= 1.0:
         return course
-    numbers = np.arange(known[-1] + 1)
-    pace = (place[-1] - place[0]) / (known[-1] - known[0])
-    placed = np.interp(numbers, known, place) + pace * np.minimum(numbers - known[0], 0)
+    numbers = np.arange(logged[-1] + 1)
+    pace = (place[-1] - place[0]) / (logged[-1] - logged[0])
+    placed = np.interp(numbers, logged, place) + pace * np.minimum(numbers - logged[0], 0)
     # No car drove beyond the highest number in the log, so the spacing there is arbitrary.
-    at = np.concatenate([placed, np.arange(placed[-1] + pace, placed[0] + 1.0 - 0.5 * pace, pace)]) % 1.0
-    own = waypoint_positions(course)
-    borders = [np.interp(at, own, axis) for axis in (*course.inner.T, *course.outer.T)]
-    rows = np.column_stack([course.points_at(at), *borders])
+    positions = (
+        np.concatenate([placed, np.arange(placed[-1] + pace, placed[0] + 1.0 - 0.5 * pace, pace)]) % 1.0
+    )
+    course_positions = waypoint_positions(course)
+    borders = [np.interp(positions, course_positions, axis) for axis in (*course.inner.T, *course.outer.T)]
+    rows = np.column_stack([course.points_at(positions), *borders])
     rows = np.vstack([rows, rows[:1]]) if course.closed else rows
     rows = rows[::-1] if course.reversed else rows
     return Track.from_route(
@@ -230,8 +232,8 @@ def estimated_course(name: str, steps: pd.DataFrame) -> Track | None:
     ahead /= np.maximum(np.linalg.norm(ahead, axis=1), 1e-9)[:, None]
     left = np.column_stack([-ahead[:, 1], ahead[:, 0]])
     on_road = rows[rows["all_wheels_on_track"].to_numpy(bool)]
-    at = on_road["closest_waypoint"].to_numpy(np.intp)
-    aside = np.abs(((on_road[["X", "Y"]].to_numpy(np.float64) - center[at]) * left[at]).sum(axis=1))
+    index = on_road["closest_waypoint"].to_numpy(np.intp)
+    aside = np.abs(((on_road[["X", "Y"]].to_numpy(np.float64) - center[index]) * left[index]).sum(axis=1))
     half_m = _HALF_CAR_M + (float(np.quantile(aside, 0.98)) if len(aside) else _HALF_CAR_M)
     side = left if shapely.is_ccw(shapely.LinearRing(ring)) else -left
     route = np.column_stack([center, center + half_m * side, center - half_m * side])

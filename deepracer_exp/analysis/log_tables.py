@@ -88,17 +88,19 @@ def table_of(rows: pd.DataFrame, columns: Mapping[str, tuple[str, str]], left_ou
 def iteration_rows(view: LogView) -> Table:
     """Return results and metrics of each iteration; of very many, every second, third, ... and the last."""
     table = view.iterations.replace({"steps": {0: math.nan}})  # those in metrics files only have no trace
-    known = table.replace({"checkpoint": ""}, None).notna().any()
+    named = table.replace({"checkpoint": ""}, None).notna().any()
     every = math.ceil(len(table) / MOST_ITERATIONS) or 1
     shown = table.iloc[::-1].iloc[::every].iloc[::-1]
-    columns = {name: column for name, column in _ITERATION_COLUMNS.items() if known[name]}
+    columns = {name: column for name, column in _ITERATION_COLUMNS.items() if named[name]}
     return table_of(shown, columns, len(table) - len(shown))
 
 
 def candidate_rows(view: LogView) -> Table:
     """Return the checkpoints worth submitting, the best first: `LogView.candidates`."""
-    known = view.candidates.replace({"checkpoint": ""}, None).notna().any()
-    return table_of(view.candidates, {name: one for name, one in _CANDIDATE_COLUMNS.items() if known[name]})
+    named = view.candidates.replace({"checkpoint": ""}, None).notna().any()
+    return table_of(
+        view.candidates, {name: label for name, label in _CANDIDATE_COLUMNS.items() if named[name]}
+    )
 
 
 def best_laps(view: LogView) -> Table:
@@ -124,24 +126,24 @@ def problem_rows(view: LogView) -> Table:
 def facts(view: LogView) -> list[tuple[str, str]]:
     """Return course, action space and evaluations in names and values."""
     recording, course = view.recording, view.course
-    found: list[tuple[str, str]] = []
+    lines: list[tuple[str, str]] = []
     if course is not None:
         way = ", reversed" if course.reversed else ""
-        found.append(("Course", f"{course.title}{way}: {course.length_m:.2f} m, {course.width_m:.2f} m wide"))
+        lines.append(("Course", f"{course.title}{way}: {course.length_m:.2f} m, {course.width_m:.2f} m wide"))
     others = [
         str(name) for name in recording.steps["track"].unique() if str(name) not in ("", view.track_name)
     ]
     if others:
-        found.append(("Other courses in it", ", ".join(others)))
+        lines.append(("Other courses in it", ", ".join(others)))
     several = trainings(view)
     if several is not None:
-        found.append(("Trainings in it", several))
+        lines.append(("Trainings in it", several))
     if recording.metadata is not None:
         actions = recording.metadata.actions
         space = "continuous" if not actions else f"{len(actions)} actions"
         if view.run is None:  # a run of ours has default sensors there, whatever its policy sees
             space += f"; sensors {', '.join(recording.metadata.sensor) or NONE}"
-        found.append(("Action space", space))
+        lines.append(("Action space", space))
     driven = view.evaluation_episodes
     races = driven if view.trained else driven.iloc[:0]
     laps = int(view.episodes["lap_time_s"].notna().sum() + races["lap_time_s"].notna().sum())
@@ -150,17 +152,17 @@ def facts(view: LogView) -> list[tuple[str, str]]:
         timed = view.laps_timed
         words = f"{timed:,} of {count(laps, 'lap')} as in the service's metrics file, the others {counted}"
         words = counted if not timed else words if timed < laps else "as in the service's metrics file"
-        found.append(("Lap times", words))
+        lines.append(("Lap times", words))
     figures, where = zigzag_now(view)
     if figures is not None:
-        found.append(("Zig-zag on straights", f"{zigzag_in_words(*figures)} ({where})"))
+        lines.append(("Zig-zag on straights", f"{zigzag_in_words(*figures)} ({where})"))
     folder = run_folder(view)
     if folder is not None and view.episodes["lap_time_s"].notna().any():
-        found.append(("Against the fastest lap", loss_in_words(view, folder)))
+        lines.append(("Against the fastest lap", loss_in_words(view, folder)))
     if len(driven):
         streams = count(driven["stream"].nunique(), "evaluation")
-        found.append(("Evaluations", f"{count(len(driven), 'episode')} in {streams}"))
-    return found
+        lines.append(("Evaluations", f"{count(len(driven), 'episode')} in {streams}"))
+    return lines
 
 
 def trainings(view: LogView) -> str | None:
@@ -168,7 +170,7 @@ def trainings(view: LogView) -> str | None:
     rounds = view.recording.rounds
     if not rounds:
         return None
-    listed = ", ".join(f"{one.name} from iteration {one.first_iteration}" for one in rounds)
+    listed = ", ".join(f"{part.name} from iteration {part.first_iteration}" for part in rounds)
     return f"{len(rounds)}, taken as clones one after the other: {listed}"
 
 

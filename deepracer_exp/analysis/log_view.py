@@ -27,7 +27,7 @@ from .step_columns import add_derived, first_rows, timed_by_service
 from .tables import candidates, episode_table, iteration_table
 
 DISCOUNT = Hyperparameters().discount_factor
-"""For logs without hyperparameters: the service's default."""
+"""Discount of logs without hyperparameters: the service's default."""
 PREPARE = "prepare"
 """Status of the row in which an episode starts, before the first action."""
 LEAST_LAPS = 5
@@ -45,7 +45,7 @@ class LogView:
     name: str
     recording: Recording
     course: Track | None
-    """None: unknown; figures that need its shape are then left out."""
+    """The track; None if it is unknown, and figures that need its shape are left out."""
     track_name: str
     """Name of the course as logged, "" if it was neither logged nor recognised."""
     trained: bool
@@ -59,7 +59,7 @@ class LogView:
     iterations: pd.DataFrame
     """Their iterations, `tables.ITERATION_COLUMNS`."""
     judged: pd.DataFrame
-    """What a training is judged by: its iterations, or blocks of them where they have fewer than `LEAST_EPISODES`."""
+    """Rows that judge a training: its iterations, or blocks of them where they have fewer than `LEAST_EPISODES`."""
     evaluation_episodes: pd.DataFrame
     """Episodes on the course of all other streams, with `stream`."""
     evaluation_steps: pd.DataFrame
@@ -67,11 +67,11 @@ class LogView:
     laps_timed: int
     """Complete laps whose time a metrics file gives; that of the others is counted from the rows."""
     problems: tuple[LogProblem, ...]
-    """Those of the recording and of its courses."""
+    """Problems of the recording and of its courses."""
     discount: float
     """Factor on the reward of the next step, in `discounted_future_reward`."""
     run: RunRecording | None = None
-    """What is recorded of a run of ours alone; None: a log of the service."""
+    """The records that only a run of ours has; None for a log of the service."""
 
     @property
     def stopping(self) -> Mapping[str, Any] | None:
@@ -93,7 +93,7 @@ class LogView:
 
     @property
     def lap_word(self) -> str:
-        """What a lap of `episodes` is called: that of a training explores."""
+        """Return the name of a lap of `episodes`: a training's is an exploring one."""
         return "exploring lap" if self.trained else "lap"
 
     @property
@@ -104,7 +104,7 @@ class LogView:
 
     @property
     def traced(self) -> str:
-        """What to add to a number of episodes that are counted in the traces."""
+        """Return the words after a number of episodes that are counted in the traces."""
         return " with a trace" if self.untraced else ""
 
     @property
@@ -129,7 +129,7 @@ class LogView:
 
     @property
     def is_driven(self) -> NDArray[np.bool_]:
-        """Which rows of `steps` follow an action; prepare rows do not, and have no reward."""
+        """Whether each row of `steps` follows an action; prepare rows do not, and have no reward."""
         return (self.steps["episode_status"] != PREPARE).to_numpy()
 
     @property
@@ -211,7 +211,7 @@ def prepare(log: Recording | RunRecording, track: str | None = None) -> LogView:
     training = (steps["stream"] == TRAINING).to_numpy()
     rows, of_training = names.value_counts(), names[training].value_counts()
     logged = sorted(
-        map(str, names.cat.categories), key=lambda one: (of_training[one], rows[one]), reverse=True
+        map(str, names.cat.categories), key=lambda stream: (of_training[stream], rows[stream]), reverse=True
     )
     name = track if track in logged else logged[0]
     if track is not None and track not in logged and len(logged) > 1:
@@ -221,10 +221,10 @@ def prepare(log: Recording | RunRecording, track: str | None = None) -> LogView:
     driven_on = steps[here]
     course = tracks.get(name)
     if track is not None and track not in logged:
-        known, problems = course, ()
+        course_now, problems = course, ()
         course = directed(catalogue_track(track), catalogue_track(track, True), driven_on)
-        if known is not None and not was_driven_on(course, driven_on):
-            raise BadInput(recording.name, f"track={track} was not driven on", known.name)
+        if course_now is not None and not was_driven_on(course, driven_on):
+            raise BadInput(recording.name, f"track={track} was not driven on", course_now.name)
     course = estimated_course(name, driven_on) if course is None else numbered_as_logged(course, driven_on)
     discount = float((recording.hyperparameters or {}).get("discount_factor", DISCOUNT))
     trained, episodes, timed = _episodes(recording, here & training, course, discount)

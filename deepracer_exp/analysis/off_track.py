@@ -1,4 +1,4 @@
-"""Where the car leaves the road, and what it did before: understeer, oversteer, or a late correction."""
+"""Places where the car leaves the road, and its mistake before: understeer, oversteer, or a late correction."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -86,22 +86,22 @@ def off_track_places(steps: pd.DataFrame) -> list[OffTrackPlace]:
     judged = judge(steps, rows)
     episode = np.cumsum(first_rows(steps))
     offset = np.nan_to_num(steps["offset_m"].to_numpy(np.float64))
-    at, left = position[rows], np.ones(len(rows), bool)
-    found: list[OffTrackPlace] = []
-    while len(found) < PLACES and left.any():
-        center = at[neighbours(at, at[left], half).argmax()]
-        here = left & (_apart(at, center) <= half)
+    places, left = position[rows], np.ones(len(rows), bool)
+    found_places: list[OffTrackPlace] = []
+    while len(found_places) < PLACES and left.any():
+        center = places[neighbours(places, places[left], half).argmax()]
+        here = left & (_apart(places, center) <= half)
         offs = int(here.sum())
         if offs < LEAST:
             break
-        left &= _apart(at, center) > 2 * half
+        left &= _apart(places, center) > 2 * half
         judgements = Counter(judged[here].tolist())
         most, times = judgements.most_common(1)[0]
         # A car that is put back on the road passes the place again.
         passes = max(len(np.unique(episode[_apart(position, center) <= half])), offs)
         low, high = map(float, wilson(offs, passes))
-        middle = rows[here][np.argsort((at[here] - center + 0.5) % 1.0, kind="stable")[offs // 2]]
-        found.append(
+        middle = rows[here][np.argsort((places[here] - center + 0.5) % 1.0, kind="stable")[offs // 2]]
+        found_places.append(
             OffTrackPlace(
                 lap_position=float(position[middle]),
                 waypoint=int(steps["closest_waypoint"].to_numpy()[middle]),
@@ -114,7 +114,7 @@ def off_track_places(steps: pd.DataFrame) -> list[OffTrackPlace]:
                 judgements=judgements,
             )
         )
-    return found
+    return found_places
 
 
 def judge(steps: pd.DataFrame, rows: Rows) -> NDArray[np.str_]:
@@ -156,15 +156,15 @@ def _stretches(steps: pd.DataFrame) -> tuple[Values, Values, Values]:
         for name in ("steer", "yaw_rate_dps", "track_speed_mps")
     )
     # A command acts until the next row.
-    asked = np.degrees(_before(speed, 1) * np.tan(np.radians(_before(steer, 1))) / WHEELBASE_M)
+    commanded = np.degrees(_before(speed, 1) * np.tan(np.radians(_before(steer, 1))) / WHEELBASE_M)
     inside = since >= 2
-    columns = np.column_stack([_before(rate, 1), asked, np.ones(len(rate))])
+    columns = np.column_stack([_before(rate, 1), commanded, np.ones(len(rate))])
     lag, gain, trim = np.linalg.lstsq(columns[inside], rate[inside], rcond=None)[0]
     predicted, more, mean_steer = _before(rate, BEFORE), np.zeros(len(rate)), np.zeros(len(rate))
     slide = np.abs(np.nan_to_num(steps["slide_deg"].to_numpy(np.float64)))
     largest = slide.copy()
     for back in range(BEFORE - 1, -1, -1):
-        predicted = lag * predicted + gain * _before(asked, back) + trim
+        predicted = lag * predicted + gain * _before(commanded, back) + trim
         more += (_before(rate, back) - predicted) / BEFORE
         mean_steer += _before(steer, back + 1) / BEFORE
         largest = np.where(since >= back, np.maximum(largest, _before(slide, back)), largest)
@@ -177,10 +177,12 @@ def _before(values: Values, rows: int) -> Values:
     return values if not rows else np.concatenate([np.zeros(min(rows, len(values))), values[:-rows]])
 
 
-def neighbours(at: Values, others: Values, within: float) -> NDArray[np.intp]:
+def neighbours(places: Values, others: Values, within: float) -> NDArray[np.intp]:
     """Count for each lap position the others that are near it on the shorter way round."""
     around = np.sort(np.concatenate([others - 1.0, others, others + 1.0]))
-    return np.searchsorted(around, at + within, "right") - np.searchsorted(around, at - within, "left")
+    return np.searchsorted(around, places + within, "right") - np.searchsorted(
+        around, places - within, "left"
+    )
 
 
 def _apart(a: Values | float, b: Values | float) -> Values:

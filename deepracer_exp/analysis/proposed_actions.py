@@ -41,10 +41,10 @@ _TRIES = 10
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Commands:
-    """What complete, fast laps commanded, a row a control step."""
+    """The commands of complete, fast laps, a row a control step."""
 
     laps: str
-    """Which laps these are, in words."""
+    """Description of the laps."""
     steering_deg: Values
     """(n,), positive to the left."""
     speed_mps: Values
@@ -66,7 +66,7 @@ class ActionProposal:
     commands: Commands
     actions: tuple[Action, ...]
     to_recover: tuple[bool, ...]
-    """Of each action, whether it was added to recover with."""
+    """Whether each action was added to recover with."""
     nearest: NDArray[np.intp]
     """Number of the action that is nearest to each command (n,)."""
 
@@ -121,7 +121,7 @@ def commands_of_log(recording: Recording, track: str | None = None) -> Commands:
         raise BadInput(
             recording.name, "has no complete lap without a reset", "a run or log with laps, or a track"
         )
-    of_view = np.split(fast, np.cumsum([len(one) for one in times_s])[:-1])
+    of_view = np.split(fast, np.cumsum([len(times) for times in times_s])[:-1])
     sources = [
         f"{wanted.sum():,} of the {'training' if view.trained else 'evaluations and races'}"
         for view, wanted in zip(views, of_view, strict=True)
@@ -189,8 +189,8 @@ def propose_actions(commands: Commands, wanted: int, car: CarConfig) -> ActionPr
     listed = np.unique(np.concatenate([chosen, needed[added]]), axis=0)
     return ActionProposal(
         commands=commands,
-        actions=tuple(Action(*map(float, one)) for one in listed),
-        to_recover=tuple(bool((needed[added] == one).all(axis=1).any()) for one in listed),
+        actions=tuple(Action(*map(float, pair)) for pair in listed),
+        to_recover=tuple(bool((needed[added] == pair).all(axis=1).any()) for pair in listed),
         nearest=cdist(driven / scale, listed / scale).argmin(axis=1),
     )
 

@@ -20,7 +20,7 @@ MOST = 200
 ROUNDS = 5
 """Each round goes half of the way to its solution, which keeps the line from oscillating; five go 97 per cent."""
 WHEELBASE_M = 0.164
-"""Of every car of the service (deepracer-simapp urdf/deepracer)."""
+"""Wheelbase of every car of the service (deepracer-simapp urdf/deepracer)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -30,7 +30,7 @@ class Line:
     lap_position: Values
     """Places (n,), 0 to 1; a closed course ends where it began."""
     offset_m: Values
-    """From the centre line, positive to the left of the driving direction."""
+    """Distance from the centre line, positive to the left of the driving direction."""
     xy: Values
     """(n, 2), m."""
     curvature_pm: Values
@@ -100,11 +100,11 @@ def _road_across(course: Track, center: Values, sideways: Values) -> tuple[Value
     nearest = np.lexsort((away_m, point))
     nearest = nearest[np.unique(point[nearest], return_index=True)[1]]
     ends, part = shapely.get_coordinates(parts[nearest], return_index=True)
-    at = point[nearest][part]
-    side_m = ((ends - center[at]) * sideways[at]).sum(axis=1)
+    middle = point[nearest][part]
+    side_m = ((ends - center[middle]) * sideways[middle]).sum(axis=1)
     right_m, left_m = np.zeros(len(center)), np.zeros(len(center))
-    np.minimum.at(right_m, at, side_m)
-    np.maximum.at(left_m, at, side_m)
+    np.minimum.at(right_m, middle, side_m)
+    np.maximum.at(left_m, middle, side_m)
     return right_m, left_m
 
 

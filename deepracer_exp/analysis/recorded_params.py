@@ -67,21 +67,21 @@ class RecordedParams:
         """Return the columns `rewards.params.BATCH_COLUMNS` of some rows, which must be known."""
         part, track_index = self._steps.iloc[chosen], self.track_index[chosen]
         front = part[["X", "Y"]].to_numpy(np.float64)
-        at = self._tracks.project(front, track_index)
-        width_m, is_left = self._tracks.border_distances(front, at.center, track_index)
+        projected = self._tracks.project(front, track_index)
+        width_m, is_left = self._tracks.border_distances(front, projected.center, track_index)
         return {
             "all_wheels_on_track": part["all_wheels_on_track"].to_numpy(bool),
             "x": front[:, 0],
             "y": front[:, 1],
             "heading": part["yaw"].to_numpy(np.float64),
-            "distance_from_center": np.abs(at.offset_m),
-            "projection_distance": at.ndist * self._tracks.length_m[track_index],
+            "distance_from_center": np.abs(projected.offset_m),
+            "projection_distance": projected.ndist * self._tracks.length_m[track_index],
             "progress": part["progress"].to_numpy(np.float64),
             "steps": part["steps"].to_numpy(np.float64),
             "speed": part["throttle"].to_numpy(np.float64),
             "steering_angle": part["steer"].to_numpy(np.float64),
             "track_width": width_m,
-            "closest_waypoints": np.column_stack([at.previous, at.next]),
+            "closest_waypoints": np.column_stack([projected.previous, projected.next]),
             "is_left_of_center": is_left,
             "is_offtrack": self._off_track(part, track_index),
             "sim_time": part["tstamp"].to_numpy(np.float64),

@@ -61,7 +61,7 @@ class ReplayedRewards:
 
     @cached_property
     def correlations(self) -> dict[str, float]:
-        """With at least three laps, Spearman's rank correlations old_new, old_time and new_time.
+        """Return, of at least three laps, Spearman's rank correlations old_new, old_time and new_time.
 
         They are NaN if all values are equal. A reward that prefers fast laps correlates with time at -1.
         """
@@ -89,14 +89,14 @@ class ReplayedRewards:
 
     @property
     def sentences(self) -> list[str]:
-        """How it would rank the laps and the places."""
+        """Return in sentences how it would rank the laps and the places."""
         laps, places, name = self.laps, self.places, self.reward
-        found = [f"There is no complete lap that {name} could rank."]
+        lines = [f"There is no complete lap that {name} could rank."]
         if len(laps):
             evaluated = ", evaluations included," if laps["stream"].nunique() > 1 else ""
             best, fastest = laps.iloc[0], laps.loc[laps["time_s"].idxmin()]
             ranks = f"{_ordinal(best['time_rank'])} by time, {_ordinal(best['rank'])} by the recorded reward"
-            found = [
+            lines = [
                 f"Of {count(len(laps), 'complete lap')}{evaluated} {name} would have paid most for the one of episode "
                 f"{best['episode']} ({best['time_s']:.2f} s, {ranks}); the fastest lap ({fastest['time_s']:.2f} s) is "
                 f"{_ordinal(fastest['new_rank'])} instead of {_ordinal(fastest['rank'])}."
@@ -106,17 +106,17 @@ class ReplayedRewards:
                 key: f"{r:.2f}" if math.isfinite(r) else "not defined (all equal)"
                 for key, r in self.correlations.items()
             }
-            found.append(
+            lines.append(
                 f"Rank correlation with lap time (-1: laps are ranked by speed alone): {name} {texts['new_time']}, "
                 f"recorded reward {texts['old_time']}; between both rewards {texts['old_new']}."
             )
         if len(places):
             up, down = places.loc[places["change"].idxmax()], places.loc[places["change"].idxmin()]
-            found.append(
+            lines.append(
                 f"Compared with the other places of the track, waypoint {up['closest_waypoint']} gains most and "
                 f"waypoint {down['closest_waypoint']} loses most."
             )
-        return found
+        return lines
 
     @property
     def charts(self) -> list[Chart]:
@@ -208,12 +208,12 @@ def replay_reward(
     episode = np.cumsum((np.diff(process, prepend=-1) != 0) | (np.diff(number, prepend=-1) != 0)) - 1
     params = RecordedParams(steps, episode, view.course, car)
     new_reward = np.where(params.known, 0.0, np.nan)
-    for one in np.unique(process[params.paid]):
+    for run_number in np.unique(process[params.paid]):
         function = RewardFunction(source, 1, time_limit_s, None)
-        own = np.flatnonzero(params.paid & (process == one))
+        replayed = np.flatnonzero(params.paid & (process == run_number))
         pay = _at_once if function.is_batch else _one_by_one
-        for begin in range(0, len(own), _AT_ONCE):
-            some = own[begin : begin + _AT_ONCE]
+        for begin in range(0, len(replayed), _AT_ONCE):
+            some = replayed[begin : begin + _AT_ONCE]
             new_reward[some] = pay(function, params, steps, some)
     steps["new_reward"] = new_reward
     return ReplayedRewards(
@@ -232,29 +232,31 @@ def _at_once(
         # One car per row: `reward_batch` does not distinguish cars from steps.
         return function(params.columns(some), params.track_params, track_index=params.track_index[some])
     except RewardFailed as error:
-        at = f"{len(some):,} steps at once" if error.car is None else _place(steps, some[error.car])
-        raise BadInput(function.source.path, f"reward_batch {error.what} ({at})") from error
+        place = f"{len(some):,} steps at once" if error.car is None else _place(steps, some[error.car])
+        raise BadInput(function.source.path, f"reward_batch {error.what} ({place})") from error
 
 
 def _one_by_one(
     function: RewardFunction, params: RecordedParams, steps: pd.DataFrame, some: Ids
 ) -> NDArray[np.float64]:
     paid = np.empty(len(some))
-    at = 0
+    index = 0
     try:
         with Guard(function.time_limit_s) as guard:
-            for at, given in enumerate(params.dicts(some)):
-                paid[at] = function.compute(given)
+            for index, values in enumerate(params.dicts(some)):
+                paid[index] = function.compute(values)
                 guard.restart()
     except (RewardFailed, Misconduct) as error:
         what = error.what if isinstance(error, RewardFailed) else str(error)
-        raise BadInput(function.source.path, f"reward_function {what} ({_place(steps, some[at])})") from error
+        raise BadInput(
+            function.source.path, f"reward_function {what} ({_place(steps, some[index])})"
+        ) from error
     return paid
 
 
 def _place(steps: pd.DataFrame, row: int) -> str:
-    at = steps.iloc[row]
-    return f"{at['stream']}, episode {at['episode']}, step {at['steps']}"
+    step = steps.iloc[row]
+    return f"{step['stream']}, episode {step['episode']}, step {step['steps']}"
 
 
 def _laps(steps: pd.DataFrame, episode: NDArray[np.int64], view: LogView) -> pd.DataFrame:

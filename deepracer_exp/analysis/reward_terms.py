@@ -82,20 +82,20 @@ def contributed_terms(
     evaluated = np.flatnonzero(params.paid)
     if not len(evaluated):
         return None
-    found: list[dict[str, float]] = []
+    by_step: list[dict[str, float]] = []
     try:
         with Guard(time_limit_s) as guard:
-            for given in params.dicts(evaluated):
-                found.append(_checked(terms, given))
+            for values in params.dicts(evaluated):
+                by_step.append(_checked(terms, values))
                 guard.restart()
     except CtrlC:
         raise
     except BaseException as error:  # noqa: BLE001 - raised again as BadInput
         what, cause = what_happened(error, source.path, time_limit_s)
-        at = steps.iloc[evaluated[min(len(found), len(evaluated) - 1)]]
-        place = f"episode {at['episode']}, step {at['steps']}"
+        step = steps.iloc[evaluated[min(len(by_step), len(evaluated) - 1)]]
+        place = f"episode {step['episode']}, step {step['steps']}"
         raise BadInput(source.path, f"terms {what} ({place})") from cause
-    return pd.DataFrame(found, index=steps.index[evaluated]).fillna(0.0)
+    return pd.DataFrame(by_step, index=steps.index[evaluated]).fillna(0.0)
 
 
 def _checked(terms: Terms, params: dict[str, Any]) -> dict[str, float]:

@@ -49,20 +49,20 @@ def sectors_of(course: Track) -> list[Sector]:
     kinds = np.where(np.abs(curvature) < BEND_PM, 0, np.sign(curvature)).astype(int)
     cuts = [0, *(np.flatnonzero(np.diff(kinds)) + 1), count]
     while len(cuts) > 2 and np.diff(cuts).min() * course.length_m / count < SHORTEST_M:
-        at = int(np.diff(cuts).argmin())
+        shortest = int(np.diff(cuts).argmin())
         means = [float(curvature[a:b].mean()) for a, b in pairwise(cuts)]
-        neighbours = [k for k in (at - 1, at + 1) if 0 <= k < len(means)]
-        like = min(neighbours, key=lambda k: abs(means[k] - means[at]))
-        del cuts[max(at, like)]
+        neighbours = [k for k in (shortest - 1, shortest + 1) if 0 <= k < len(means)]
+        like = min(neighbours, key=lambda k: abs(means[k] - means[shortest]))
+        del cuts[max(shortest, like)]
     # By now neighbours may be of one kind.
     merged = [_kind(curvature[a:b]) for a, b in pairwise(cuts)]
     bounds = [0, *(cut for cut, (a, b) in zip(cuts[1:-1], pairwise(merged), strict=True) if a != b), count]
     waypoint_at = waypoint_positions(course)
     last = len(waypoint_at) - 1 - course.closed
-    found = []
+    sectors = []
     for number, (a, b) in enumerate(pairwise(bounds), start=1):
         inside = np.flatnonzero((waypoint_at >= edges[a]) & (waypoint_at < edges[b]))
-        found.append(
+        sectors.append(
             Sector(
                 name=f"{_kind(curvature[a:b])} {number}",
                 begin=float(edges[a]),
@@ -71,13 +71,13 @@ def sectors_of(course: Track) -> list[Sector]:
                 last_waypoint=min(int(inside[-1]), last) if len(inside) else 0,
             )
         )
-    return found
+    return sectors
 
 
 def sector_at(sectors: Sequence[Sector], lap_position: Values) -> NDArray[np.intp]:
     """Return in which sector places lie, -1 where they are not known."""
-    found = np.searchsorted([part.end for part in sectors[:-1]], lap_position, side="right")
-    return np.where(np.isfinite(lap_position), found, -1)
+    index = np.searchsorted([part.end for part in sectors[:-1]], lap_position, side="right")
+    return np.where(np.isfinite(lap_position), index, -1)
 
 
 def _kind(curvature_pm: Values) -> str:
@@ -91,7 +91,7 @@ def _curvature(course: Track, place: Values) -> Values:
     low, high = place - half, place + half
     if not course.closed:
         low, high = np.maximum(low, 0.0), np.minimum(high, 1.0)
-    before, after = (course.start_pose(at).yaw_rad for at in (low, high))
+    before, after = (course.start_pose(edge).yaw_rad for edge in (low, high))
     return ((after - before + np.pi) % (2 * np.pi) - np.pi) / ((high - low) * course.length_m)
 
 
@@ -120,12 +120,12 @@ def interval_times(steps: pd.DataFrame, bounds: Values) -> pd.DataFrame:
     gone = np.clip(columns["progress"][row] / 100.0, 0.0, 1.0)
     # Every lap begins with a point of its own, so that nothing is interpolated between two laps.
     starts = np.cumsum(rows) - rows
-    at = np.insert(np.maximum.accumulate(_APART * lap + gone), starts, _APART * np.arange(len(laps)))
+    places = np.insert(np.maximum.accumulate(_APART * lap + gone), starts, _APART * np.arange(len(laps)))
     time_s = np.insert(columns["lap_clock_s"][row], starts, 0.0)
     start = (columns["lap_position"][begin] - columns["progress"][begin] / 100.0) % 1.0
     relative = (bounds[None, :-1] - start[:, None]) % 1.0  # bound 1 is bound 0 again
     query = _APART * np.arange(len(laps))[:, None] + relative
-    passed_s = np.interp(query.ravel(), at, time_s).reshape(relative.shape) if len(laps) else relative
+    passed_s = np.interp(query.ravel(), places, time_s).reshape(relative.shape) if len(laps) else relative
     passed_s[relative == 0.0] = 0.0  # the car stands there for a step
     next_s, next_at = np.roll(passed_s, -1, axis=1), np.roll(relative, -1, axis=1)
     spent_s = next_s - passed_s + np.where(next_at <= relative, lap_time_s[:, None], 0.0)

@@ -1,4 +1,4 @@
-"""Whether the laps of a training became slower, and whether its return rose meanwhile."""
+"""Test whether the laps of a training became slower, and whether its return rose meanwhile."""
 
 from dataclasses import dataclass
 
@@ -68,14 +68,14 @@ def slower_laps(iterations: pd.DataFrame) -> SlowerLaps | None:
             them with `LEAST_TIMES` lap times counts. Evaluations with fewer complete laps than `RELIABLE` do not.
     """
     for column, name in SERIES.items():
-        known = iterations[column].notna()
+        measured = iterations[column].notna()
         if column.startswith("eval_"):  # the few laps that an unreliable policy completes may be fast ones
-            known &= iterations["eval_lap_share"] >= RELIABLE
-        if known.sum() >= LEAST_TIMES:
+            measured &= iterations["eval_lap_share"] >= RELIABLE
+        if measured.sum() >= LEAST_TIMES:
             # The return of an evaluated policy is that of the iterations since the evaluation before.
-            block = known.cumsum() - known
-            returns = iterations["reward_mean"].groupby(block).mean().to_numpy()[: known.sum()]
-            rows = iterations[known]
+            block = measured.cumsum() - measured
+            returns = iterations["reward_mean"].groupby(block).mean().to_numpy()[: measured.sum()]
+            rows = iterations[measured]
             return _tested(
                 name,
                 rows["iteration"].to_numpy(np.int64),
@@ -111,5 +111,5 @@ def _tested(name: str, iteration: np.ndarray, laps_s: Values, returns: Values) -
 
 def _rises(values: Values, chance: float) -> bool:
     """Return whether values rise with their order beyond a chance."""
-    found = kendalltau(np.arange(len(values)), values, alternative="greater", nan_policy="omit")
-    return bool(found.pvalue < chance)
+    trend = kendalltau(np.arange(len(values)), values, alternative="greater", nan_policy="omit")
+    return bool(trend.pvalue < chance)

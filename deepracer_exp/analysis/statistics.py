@@ -60,19 +60,19 @@ def subsample(count: int, most: int) -> NDArray[np.intp]:
 
 def totals(place: NDArray[np.intp], values: ArrayLike | None, n: int) -> Values:
     """Return the sum of values (None: the number of rows) at each of n places; -1 is no place, NaN no value."""
-    known = place >= 0
+    placed = place >= 0
     if values is None:
-        return np.bincount(place[known], minlength=n).astype(np.float64)
+        return np.bincount(place[placed], minlength=n).astype(np.float64)
     numbers = np.asarray(values, np.float64)
-    known &= np.isfinite(numbers)
-    return np.bincount(place[known], numbers[known], minlength=n).astype(np.float64)
+    placed &= np.isfinite(numbers)
+    return np.bincount(place[placed], numbers[placed], minlength=n).astype(np.float64)
 
 
 def means(place: NDArray[np.intp], values: ArrayLike, n: int, least: int = 1) -> Values:
     """Return the mean of values at each of n places; NaN where fewer than `least` are known."""
     values = np.asarray(values, np.float64)
-    known = totals(np.where(np.isfinite(values), place, -1), None, n)
-    return totals(place, values, n) / np.where(known >= least, known, np.nan)
+    counts = totals(np.where(np.isfinite(values), place, -1), None, n)
+    return totals(place, values, n) / np.where(counts >= least, counts, np.nan)
 
 
 def quantiles(place: NDArray[np.intp], values: ArrayLike, n: int, shares: tuple[float, ...]) -> Values:

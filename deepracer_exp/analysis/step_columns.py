@@ -35,9 +35,9 @@ DERIVED_COLUMNS: Mapping[str, str] = {
 CONTROL_PERIOD_S = 1 / 15
 """The service's, for recordings without two rows in succession."""
 FRONT_TO_REAR_AXLE_M = 0.14 + 0.081663
-"""From the logged point back to the rear axle (deepracer-simapp: front point, rear wheels of the car's model)."""
+"""Distance from the logged point to the rear axle (deepracer-simapp: front point, rear wheels of the model)."""
 STILL_M = 0.01
-"""Below this a movement has no direction."""
+"""Movement below which a car has no direction of travel."""
 STOPPED = ("off_track", "crashed", "immobilized", "reversed")
 """Status of the rows after which a car is put back, or the episode ends."""
 FIRST_STEPS = 2
@@ -135,8 +135,8 @@ def _places(
 ) -> tuple[Values, Values, Values]:
     """Return lap position, offset and the centre line's direction in degrees."""
     if course is not None:
-        found = course.project(steps[["X", "Y"]].to_numpy(np.float64))
-        return found.ndist, found.offset_m, np.degrees(found.heading_rad)
+        projected = course.project(steps[["X", "Y"]].to_numpy(np.float64))
+        return projected.ndist, projected.offset_m, np.degrees(projected.heading_rad)
     unknown = np.full(len(steps), np.nan)
     if not len(steps):
         return unknown, unknown, unknown

@@ -98,7 +98,7 @@ def episode_table(steps: pd.DataFrame) -> pd.DataFrame:
     complete, put_back = progress >= 100.0, resets(steps)
     timed = complete & whole_from_start(steps) & (time_s > 0)
     per_lap = np.divide(100.0, progress, out=np.full(len(begin), np.nan), where=progress > 0)
-    first_row, last_row = (steps.iloc[at].reset_index(drop=True) for at in (begin, end))
+    first_row, last_row = (steps.iloc[rows].reset_index(drop=True) for rows in (begin, end))
     status = last_row["episode_status"].astype(str)
     unknown, ended = status == "", last_row["done"].astype(bool)
     off = unknown & ended & ~last_row["all_wheels_on_track"].astype(bool)
@@ -155,8 +155,10 @@ def iteration_table(
     updates = recording.updates.groupby("iteration")[list(_REPORTED)].mean()
     evaluated = _evaluated(recording, evaluations)
     if least_episodes:
-        known = driven.index.union(ended["iteration"].unique()).union(updates.index).union(evaluated.index)
-        row_of = _put_together(known, ended["iteration"], least_episodes)
+        iterations = (
+            driven.index.union(ended["iteration"].unique()).union(updates.index).union(evaluated.index)
+        )
+        row_of = _put_together(iterations, ended["iteration"], least_episodes)
         ended = ended.assign(iteration=ended["iteration"].map(row_of))
         driven = driven.groupby(row_of).sum()
         updates, evaluated = updates.groupby(row_of).mean(), evaluated.groupby(row_of).mean()
@@ -175,10 +177,10 @@ def iteration_table(
             "speed_mps": groups["speed_mps"].mean(),
         }
     )
-    known = driven.index.union(table.index).union(updates.index)
-    table = table.reindex(known).join(updates).join(evaluated).assign(steps=driven)
+    iterations = driven.index.union(table.index).union(updates.index)
+    table = table.reindex(iterations).join(updates).join(evaluated).assign(steps=driven)
     table = table.fillna({"episodes": 0, "complete": 0, "steps": 0})
-    table["checkpoint"] = [recording.checkpoints.get(k, "") for k in known]
+    table["checkpoint"] = [recording.checkpoints.get(k, "") for k in iterations]
     whole = dict.fromkeys(("iteration", "episodes", "steps", "complete"), np.int64)
     return table.rename_axis("iteration").reset_index()[list(ITERATION_COLUMNS)].astype(whole)
 

@@ -36,7 +36,7 @@ class ZigZag:
     straight_m: float = 0.0
     """Driven on straights, m."""
     laps: float = 0.0
-    """The same in laps: over the length of all straights of a lap."""
+    """Driven length in laps: over the length of all straights of a lap."""
     changes: int = 0
     """Times the steering changed from at least `CENTRED_DEG` to one side to as much to the other, without leaving the
     straight and without the first of them; in between it may be less for any time."""
@@ -145,8 +145,8 @@ def zigzag_in(steps: pd.DataFrame, course: Track | None, wanted: NDArray[np.bool
     x_m, y_m, steering_deg, time_s = (
         steps[name].to_numpy(np.float64)[rows] for name in ("X", "Y", "steer", "tstamp")
     )
-    known = np.isfinite(x_m) & np.isfinite(y_m) & np.isfinite(steering_deg)
-    drives = steps["episode_status"].isin(DRIVES).to_numpy()[rows] & known
+    finite = np.isfinite(x_m) & np.isfinite(y_m) & np.isfinite(steering_deg)
+    drives = steps["episode_status"].isin(DRIVES).to_numpy()[rows] & finite
     return zigzag_of(
         course, np.nan_to_num(x_m), np.nan_to_num(y_m), steering_deg, time_s, number[rows], drives
     )
@@ -166,9 +166,9 @@ def _changes(one_pass: NDArray[np.integer], steering_deg: Values) -> tuple[int, 
     side, one_pass = side[steers], one_pass[steers]
     begins = np.ones(len(steers), bool)
     begins[1:] = (np.diff(one_pass) != 0) | (np.diff(side) != 0)
-    at = np.flatnonzero(begins)
-    largest_deg = np.maximum.reduceat(np.abs(steering_deg[steers]), at)
-    again = np.diff(one_pass[at]) == 0
+    starts = np.flatnonzero(begins)
+    largest_deg = np.maximum.reduceat(np.abs(steering_deg[steers]), starts)
+    again = np.diff(one_pass[starts]) == 0
     again[1:] &= again[:-1]
     again[:1] = False
     swings_deg = (largest_deg[1:] + largest_deg[:-1]) / 2

@@ -14,7 +14,7 @@ from typing import IO, Any
 READ_ERRORS = (OSError, EOFError, zlib.error, lzma.LZMAError, tarfile.TarError, zipfile.BadZipFile)
 """Errors of reading a file or a member of an archive."""
 ZIP = (b"PK\x03\x04", b"PK\x05\x06")
-"""How a zip archive begins, one without members as well."""
+"""First bytes of a zip archive, with and without members."""
 _HEADER_BYTES = 2**20
 """Most bytes of a long name in an archive."""
 
@@ -48,7 +48,7 @@ class ArchiveMember:
 
     name: str
     size: int
-    """In bytes, unpacked."""
+    """Unpacked size in bytes."""
     kind: str
     """`file`, `folder`, `link` or `other`."""
     entry: tarfile.TarInfo | zipfile.ZipInfo

@@ -1,4 +1,4 @@
-"""Which actions the car takes, and where."""
+"""The actions that the car takes, and the places where it takes them."""
 
 from dataclasses import dataclass
 
@@ -45,7 +45,7 @@ class ActionClasses:
     """Class of each row (n,); -1 where no action is logged."""
     names: tuple[str, ...]
     steering_deg: Values
-    """Of each class, positive to the left; the mean of its rows if it is a range."""
+    """Steering angle of each class, positive to the left; the mean of its rows if it is a range."""
     continuous: bool
     """Whether classes are ranges of a continuous action space."""
 
@@ -58,14 +58,14 @@ def action_classes(view: LogView) -> ActionClasses | None:
 def classify(rows: pd.DataFrame) -> ActionClasses | None:
     """Sort the actions of rows with `COLUMNS` into classes; None if none is logged."""
     steer, speed = rows["steer"].to_numpy(np.float64), rows["throttle"].to_numpy(np.float64)
-    known = np.isfinite(steer) & np.isfinite(speed)
-    if not known.any():
+    logged = np.isfinite(steer) & np.isfinite(speed)
+    if not logged.any():
         return None
     action = rows["action"].to_numpy(np.float64)
-    listed = pd.unique(action[known])
+    listed = pd.unique(action[logged])
     continuous = bool(not np.isfinite(listed).all() or len(listed) > MOST_CLASSES)
     key = _ranges(steer, speed) if continuous else action
-    groups = pd.DataFrame({"steer": steer, "speed": speed})[known].groupby(key[known]).mean()
+    groups = pd.DataFrame({"steer": steer, "speed": speed})[logged].groupby(key[logged]).mean()
     if continuous:
         both = [f"{side}, {pace}" for side in STEERING_NAMES for pace in SPEED_NAMES]
         names = [both[int(k)] for k in groups.index]
@@ -74,10 +74,10 @@ def classify(rows: pd.DataFrame) -> ActionClasses | None:
         groups = groups.sort_values(
             ["steer", "speed"], key=lambda column: column.round(1 + (column.name != "steer") * 2)
         )
-        names = [f"{_angle(one.steer)} {one.speed:.2g} m/s" for one in groups.itertuples()]
+        names = [f"{_angle(group.steer)} {group.speed:.2g} m/s" for group in groups.itertuples()]
     return ActionClasses(
         rows=rows,
-        number=groups.index.get_indexer(np.where(known, key, np.nan)),
+        number=groups.index.get_indexer(np.where(logged, key, np.nan)),
         names=tuple(names),
         steering_deg=groups["steer"].to_numpy(),
         continuous=continuous,
@@ -149,8 +149,8 @@ def zero_steering_top_speed(view: LogView) -> Chart | None:
         ("both", straight & top),
     ):
         share = 100.0 * means(where, flag, grid.count, LEAST_STEPS)
-        known = share[np.isfinite(share)]
-        highest = max(float(np.percentile(known, 98)), 1.0) if len(known) else 100.0
+        finite = share[np.isfinite(share)]
+        highest = max(float(np.percentile(finite, 98)), 1.0) if len(finite) else 100.0
         cells = grid.cells(share, "% of steps", value_range=(0.0, highest))
         title = f"{name}: {100.0 * flag.mean():.0f}% of all"
         panels.append(map_panel(view.course, [cells], title, numbers=False))
@@ -174,12 +174,12 @@ def entropy_along_track(view: LogView) -> Chart | None:
     first, last = (_action_entropy(actions, np.where(third == k, waypoint, -1), n) for k in (0, 2))
     if not np.isfinite(last).any():
         return None
-    most, at = float(np.log(m)), np.arange(n)
+    most, waypoints = float(np.log(m)), np.arange(n)
     alike = f"all {m} actions equally often, ln {m} = {most:.2f}"
     lines = [
-        line(at, first, PALE, "first third of the iterations"),
-        line(at, last, BLUE, "last third", width=2.5),
-        line(at, np.full(n, most), ORANGE, alike, dashed=True),
+        line(waypoints, first, PALE, "first third of the iterations"),
+        line(waypoints, last, BLUE, "last third", width=2.5),
+        line(waypoints, np.full(n, most), ORANGE, alike, dashed=True),
     ]
     rows = [[waypoint_panel(lines, "entropy, nats", n, y_range=(0.0, 1.08 * most))]]
     if view.course is not None:

@@ -16,10 +16,10 @@ _WIDTH = 0.26
 def against_fastest(view: LogView) -> Chart | None:
     """Draw the seconds that a run's lap loses to the fastest lap of its car, by sector and cause."""
     folder = run_folder(view)
-    found = None if folder is None else loss(view, folder)
-    if found is None:
+    lost = None if folder is None else loss(view, folder)
+    if lost is None:
         return None
-    table = found.by_sector
+    table = lost.by_sector
     places = np.arange(len(table))
     layers = [
         bars(places + (number - 1) * _WIDTH, table[cause].to_numpy(), _COLORS[cause], cause, width=_WIDTH)
@@ -28,7 +28,7 @@ def against_fastest(view: LogView) -> Chart | None:
     return Chart(
         name="against_fastest",
         title="Seconds lost to the fastest lap of this car",
-        caption=f"The fastest {view.lap_word} from the start line: {lost_in_words(found)}. Line is a longer way, "
+        caption=f"The fastest {view.lap_word} from the start line: {lost_in_words(lost)}. Line is a longer way, "
         "steering the way that turning to and fro adds to it, speed the rest; below zero the lap gains. The fastest "
         "lap itself: `deepracer-exp tracks NAME --fastest`.",
         rows=[[Panel(layers=layers, y_label="seconds lost", x_names=list(table.index))]],

@@ -30,14 +30,19 @@ def lap_line(view: LogView) -> Chart | None:
     if lap is None or view.course is None:
         return None
     row = view.episodes.loc[view.episodes["lap_time_s"].idxmin()]
-    known = lap[lap["track_speed_mps"].notna()]
+    moving = lap[lap["track_speed_mps"].notna()]
     hover = [
         f"step {step.steps:.0f}, waypoint {step.closest_waypoint}, {step.progress:.1f}%\n"
         f"driven {step.track_speed_mps:.2f} m/s, commanded {step.throttle:.2f} m/s, steering {step.steer:.1f}°"
-        for step in known.itertuples()
+        for step in moving.itertuples()
     ]
     dots = colored_points(
-        known["X"], known["Y"], known["track_speed_mps"], "speed along the track, m/s", size=7.5, hover=hover
+        moving["X"],
+        moving["Y"],
+        moving["track_speed_mps"],
+        "speed along the track, m/s",
+        size=7.5,
+        hover=hover,
     )
     mean_mps = view.course.length_m / float(row["lap_time_s"])
     whose = f"iteration {row['iteration']}" if view.trained else str(row["stream"])
@@ -95,22 +100,22 @@ def speed_steering_by_waypoint(view: LogView) -> Chart | None:
     if not len(rows):
         return None
     n = view.waypoint_count
-    at, waypoint, part = np.arange(n), closest_waypoints(rows), subsample(len(rows), MOST_ROWS)
+    x, waypoint, part = np.arange(n), closest_waypoints(rows), subsample(len(rows), MOST_ROWS)
     lap = view.fastest_lap(*columns)
     panels: dict[str, list[Layer]] = {"track_speed_mps": [], "steer": []}
     for column, layers in panels.items():
         values = rows[column].to_numpy(np.float64)
         low, high = quantiles(waypoint[part], values[part], n, (0.1, 0.9))
-        layers.append(band(at, low, high, BLUE, f"{which}, 10th to 90th percentile"))
-        layers.append(line(at, means(waypoint, values, n), BLUE, "mean", width=2.5))
+        layers.append(band(x, low, high, BLUE, f"{which}, 10th to 90th percentile"))
+        layers.append(line(x, means(waypoint, values, n), BLUE, "mean", width=2.5))
         if column == "track_speed_mps":
-            layers.append(line(at, means(waypoint, rows["throttle"], n), PALE, "mean speed commanded"))
+            layers.append(line(x, means(waypoint, rows["throttle"], n), PALE, "mean speed commanded"))
         if lap is not None:
             driven = lap[lap["steps"] > STARTING_STEPS]
             # Control steps of uneven length make the speed of a single one jump.
             smooth = driven[column].rolling(3, center=True, min_periods=1).mean()
             best = _without_gaps(means(closest_waypoints(driven), smooth, n))
-            layers.append(line(at, best, INK, "fastest lap, mean of three steps", width=1.5))
+            layers.append(line(x, best, INK, "fastest lap, mean of three steps", width=1.5))
     if view.course is not None:
         places = waypoint_positions(view.course)
         grip_mps2, top_mps = _grip(rows.iloc[part]), float(rows["throttle"].max())
@@ -148,7 +153,7 @@ def racing_line(view: LogView) -> Chart | None:
     if not len(rows):
         return None
     ideal, n = minimum_curvature_line(course), view.waypoint_count
-    at = np.arange(n)
+    x = np.arange(n)
     rows = rows.iloc[subsample(len(rows), MOST_ROWS)]
     waypoint = closest_waypoints(rows)
     away_m = rows["offset_m"] - ideal.at(rows["lap_position"], ideal.offset_m)
@@ -156,9 +161,9 @@ def racing_line(view: LogView) -> Chart | None:
     places = waypoint_positions(course)[:n]
     median = beside(course, places, quantiles(waypoint, rows["offset_m"], n, (0.5,))[0][: len(places)])
     layers: list[Layer] = [
-        line(at, np.zeros(n), VERMILION, "racing line", dashed=True),
-        band(at, low, high, BLUE, f"{which}, 10th to 90th percentile"),
-        line(at, middle, BLUE, "median", width=2.5),
+        line(x, np.zeros(n), VERMILION, "racing line", dashed=True),
+        band(x, low, high, BLUE, f"{which}, 10th to 90th percentile"),
+        line(x, middle, BLUE, "median", width=2.5),
     ]
     paths: list[Layer] = [
         line(ideal.xy[:, 0], ideal.xy[:, 1], VERMILION, "racing line", dashed=True),
@@ -167,9 +172,9 @@ def racing_line(view: LogView) -> Chart | None:
     lap = view.fastest_lap(*columns)
     if lap is not None:
         own_m = lap["offset_m"] - ideal.at(lap["lap_position"], ideal.offset_m)
-        own = _without_gaps(means(closest_waypoints(lap), own_m, n))
+        line_driven = _without_gaps(means(closest_waypoints(lap), own_m, n))
         paths.append(line(lap["X"], lap["Y"], INK, "fastest lap", width=1.5))
-        layers.append(line(at, own, INK, "fastest lap", width=1.5))
+        layers.append(line(x, line_driven, INK, "fastest lap", width=1.5))
     return Chart(
         name="racing_line",
         title=f"The racing line: the car drives {100 * away_m.abs().mean():.0f} cm from it on average",

@@ -64,7 +64,7 @@ class Chart:
 
 def in_rows(panels: Sequence[Panel], columns: int = 2) -> list[Sequence[Panel]]:
     """Return panels in rows of `columns`."""
-    return [panels[at : at + columns] for at in range(0, len(panels), columns)]
+    return [panels[first : first + columns] for first in range(0, len(panels), columns)]
 
 
 def line(
@@ -131,14 +131,14 @@ def colored_points(
 def band(x: ArrayLike, low: ArrayLike, high: ArrayLike, color: str, name: str | None = None) -> go.Scatter:
     """Return the area between two lines; NaN interrupts it."""
     x, low, high = (np.asarray(values, np.float64) for values in (x, low, high))
-    known = np.isfinite(x) & np.isfinite(low) & np.isfinite(high)
+    finite = np.isfinite(x) & np.isfinite(low) & np.isfinite(high)
     around: list[NDArray[np.float64]] = []
-    for piece in np.ma.clump_unmasked(np.ma.array(x, mask=~known)):
+    for piece in np.ma.clump_unmasked(np.ma.array(x, mask=~finite)):
         there = np.column_stack([x[piece], low[piece]])
         back = np.column_stack([x[piece], high[piece]])[::-1]
         around += [there, back, np.full((1, 2), np.nan)]
     outline = np.concatenate([*around, np.zeros((0, 2))])
-    red, green, blue = (int(color[at : at + 2], 16) for at in (1, 3, 5))
+    red, green, blue = (int(color[begin : begin + 2], 16) for begin in (1, 3, 5))
     return go.Scatter(
         x=_light(outline[:-1, 0]),
         y=_light(outline[:-1, 1]),
@@ -252,7 +252,7 @@ def _hover(hover: Sequence[str] | None) -> dict[str, Any]:
 
 def color_range(values: ArrayLike) -> tuple[float, float]:
     """Return the percentiles 1 and 99 of the known values, a little apart where they are equal."""
-    known = np.asarray(values, np.float64)
-    known = known[np.isfinite(known)]
-    low, high = np.percentile(known, [1, 99]).tolist() if len(known) else (0.0, 1.0)
+    numbers = np.asarray(values, np.float64)
+    numbers = numbers[np.isfinite(numbers)]
+    low, high = np.percentile(numbers, [1, 99]).tolist() if len(numbers) else (0.0, 1.0)
     return (low, high) if low < high else (low - 0.5, high + 0.5)

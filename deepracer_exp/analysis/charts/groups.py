@@ -29,9 +29,9 @@ def learning_curve_charts(groups: Sequence[RunGroup]) -> list[Chart]:
 
 
 def _learning_curves(groups: Sequence[RunGroup], course: str, several: bool) -> Chart | None:
-    here = [(number, own) for number, group in enumerate(groups) if (own := group.on(course)).records]
+    here = [(number, runs) for number, group in enumerate(groups) if (runs := group.on(course)).records]
     longest = max(
-        (float(record.rows[-1]["env_steps"]) for _, own in here for record in own.records if record.rows),
+        (float(record.rows[-1]["env_steps"]) for _, runs in here for record in runs.records if record.rows),
         default=0,
     )
     factor, unit = (1e-6, "million control steps") if longest >= 2e6 else (1e-3, "thousand control steps")
@@ -52,7 +52,7 @@ def _learning_curves(groups: Sequence[RunGroup], course: str, several: bool) -> 
             panels.append(Panel(title=title, x_label=unit, y_label=label, layers=layers))
     if not panels:
         return None
-    seeds = sorted({len(own.records) for _, own in here})
+    seeds = sorted({len(runs.records) for _, runs in here})
     words = (
         f"Lines are interquartile means over {' or '.join(map(str, seeds))} runs, bands their bootstrap intervals "
         "(95 per cent; from three runs on)"
@@ -82,18 +82,18 @@ def best_checkpoints(groups: Sequence[RunGroup]) -> Chart | None:
     panels = []
     for figure in COMPARED:
         layers: list[Layer] = []
-        for at, (group, course) in enumerate(places):
-            own = group.on(course)
-            scores = own.scores(figure)
-            finite, found = np.sort(scores[np.isfinite(scores)]), own.estimate(figure)
-            if not len(finite) or found is None:
+        for place, (group, course) in enumerate(places):
+            runs = group.on(course)
+            scores = runs.scores(figure)
+            finite, estimate = np.sort(scores[np.isfinite(scores)]), runs.estimate(figure)
+            if not len(finite) or estimate is None:
                 continue
-            spread = at + 0.4 * ((np.arange(len(finite)) + 0.5) / len(finite) - 0.5)
+            spread = place + 0.4 * ((np.arange(len(finite)) + 0.5) / len(finite) - 0.5)
             layers.append(points(spread, finite, BLUE, None if layers else "a run", size=8))
-            if found.interval is not None and np.isfinite([found.iqm, *found.interval]).all():
-                low, high = found.interval
-                layers.append(line([at, at, at], [low, found.iqm, high], ORANGE))
-                layers.append(points([at], [found.iqm], ORANGE, size=13, symbol="diamond"))
+            if estimate.interval is not None and np.isfinite([estimate.iqm, *estimate.interval]).all():
+                low, high = estimate.interval
+                layers.append(line([place, place, place], [low, estimate.iqm, high], ORANGE))
+                layers.append(points([place], [estimate.iqm], ORANGE, size=13, symbol="diamond"))
         if layers:
             name, x_range = FORMS[figure][0], (-0.5, len(places) - 0.5)
             title = name.partition(",")[0].capitalize()

@@ -34,7 +34,7 @@ LAP_COLUMNS: Mapping[str, str] = {
     "start": "start position, per cent of the track",
     "iteration": ITERATION,
 }
-"""What lap times may correlate with, with unit."""
+"""Columns that lap times may correlate with, with their units."""
 _SMOOTHED = 5
 """Control steps in the mean of speed and steering along a lap."""
 _ENOUGH = 20
@@ -65,18 +65,18 @@ def lap_time_histogram(view: LogView) -> Chart | None:
 
 
 def _histogram_panel(title: str, times_s: Values) -> Panel:
-    found = histogram(times_s)
+    bins = histogram(times_s)
     best, mean, deviation = float(times_s.min()), float(times_s.mean()), _deviation(times_s)
-    layers: list[Layer] = [bars(found.centers, found.counts, SKY, width=found.width)]
+    layers: list[Layer] = [bars(bins.centers, bins.counts, SKY, width=bins.width)]
     marks = [(mean, f"mean {mean:.2f} s", BLUE), (best, f"best {best:.2f} s", GREEN)]
     if deviation > 0:
         span = np.linspace(min(best, mean - 3.5 * deviation), mean + 3.5 * deviation, 120)
-        expected = len(times_s) * found.width * norm.pdf(span, mean, deviation)
+        expected = len(times_s) * bins.width * norm.pdf(span, mean, deviation)
         layers.append(line(span, expected, FAINT, "normal distribution", width=1.5))
         for times, color in ((-2, ORANGE), (-3, VERMILION)):
-            at = mean + times * deviation
-            marks.append((at, f"{times} sd {at:.2f} s: {100 * CHANCES[times]:.3f}%", color))
-    layers += [mark(at, label, color, in_legend=True) for at, label, color in marks]
+            position = mean + times * deviation
+            marks.append((position, f"{times} sd {position:.2f} s: {100 * CHANCES[times]:.3f}%", color))
+    layers += [mark(position, label, color, in_legend=True) for position, label, color in marks]
     return Panel(title=f"{title} ({len(times_s)})", x_label="lap time, s", y_label="laps", layers=layers)
 
 
@@ -200,8 +200,8 @@ def ordinary_lap(episodes: pd.DataFrame, fastest: int) -> int:
     # A lap from another start stands still elsewhere, which would be most of the difference.
     same_start = others[others["start_at"] == episodes.loc[fastest, "start_at"]]
     late = same_start[same_start.index >= others.index[len(others) // 2]]
-    found = next((part for part in (late, same_start) if len(part) >= 3), others)
-    return int(found.sort_values("lap_time_s", kind="stable").index[len(found) // 2])
+    ordinary = next((part for part in (late, same_start) if len(part) >= 3), others)
+    return int(ordinary.sort_values("lap_time_s", kind="stable").index[len(ordinary) // 2])
 
 
 def _along(view: LogView, lap: int) -> pd.DataFrame:
@@ -215,11 +215,13 @@ def _along(view: LogView, lap: int) -> pd.DataFrame:
 
 
 def _loss_in_words(sectors: Sequence[Sector], delta: pd.DataFrame) -> str:
-    at, lost_s = (delta[name].to_numpy(np.float64) for name in ("lap_position", "delta_s"))
+    positions, lost_s = (delta[name].to_numpy(np.float64) for name in ("lap_position", "delta_s"))
     slower = f"The ordinary lap is {lost_s[-1]:.2f} s slower than the fastest"
     if not sectors:
         return f"{slower}."
-    lost = {part.name: float(np.diff(np.interp([part.begin, part.end], at, lost_s))[0]) for part in sectors}
+    lost = {
+        part.name: float(np.diff(np.interp([part.begin, part.end], positions, lost_s))[0]) for part in sectors
+    }
     worst = max(lost, key=lambda name: lost[name])
     return f"{slower} and loses most to it in sector {worst}: {lost[worst]:.2f} s."
 
@@ -242,11 +244,11 @@ def correlations(view: LogView) -> Chart | None:
     panels = []
     for name in r.index[:_MOST_PANELS]:
         layers: list[Layer] = [points(shown[name], shown["lap_time_s"], BLUE, size=5)]
-        known = laps[laps[name].notna()]
+        rows = laps[laps[name].notna()]
         for degree, color in ((1, VERMILION), (2, ORANGE)):
-            if len(known) >= _FITTED and known[name].nunique() > degree + 1:
-                span = np.linspace(known[name].quantile(0.005), known[name].quantile(0.995), 60)
-                fit = Polynomial.fit(known[name], known["lap_time_s"], degree)
+            if len(rows) >= _FITTED and rows[name].nunique() > degree + 1:
+                span = np.linspace(rows[name].quantile(0.005), rows[name].quantile(0.995), 60)
+                fit = Polynomial.fit(rows[name], rows["lap_time_s"], degree)
                 layers.append(line(span, fit(span), color, dashed=degree > 1))
         panels.append(
             Panel(
@@ -278,7 +280,7 @@ def _lap_columns(view: LogView) -> pd.DataFrame:
         started=part["track_speed_mps"].where(part.groupby(lap).cumcount() == 7),
     )
     groups = part.groupby(lap)
-    found = pd.DataFrame(
+    per_lap = pd.DataFrame(
         {
             "speed_mean_mps": groups["track_speed_mps"].mean(),
             "speed_top_mps": groups["track_speed_mps"].max(),
@@ -292,8 +294,8 @@ def _lap_columns(view: LogView) -> pd.DataFrame:
             "start": 100.0 * ((groups["lap_position"].first() - groups["progress"].first() / 100.0) % 1.0),
         }
     )
-    own = view.episodes.loc[found.index, ["lap_time_s", "dist_m", "reward", "iteration"]]
-    return own.join(found)[["lap_time_s", *LAP_COLUMNS]]
+    summed = view.episodes.loc[per_lap.index, ["lap_time_s", "dist_m", "reward", "iteration"]]
+    return summed.join(per_lap)[["lap_time_s", *LAP_COLUMNS]]
 
 
 def start_position(view: LogView) -> Chart | None:

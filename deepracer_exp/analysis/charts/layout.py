@@ -64,7 +64,7 @@ class _Box:
 
     panel: Panel
     width: float
-    """Of its column."""
+    """Width of its column."""
     columns: int
     rows: int
     narrow: bool
@@ -137,7 +137,7 @@ class _Box:
 
 @dataclass(frozen=True, kw_only=True)
 class _Axes:
-    """Where the axes of a panel are in the figure: shares of its width and height, which are in pixels."""
+    """Position of a panel's axes in the figure: shares of its width and height, which are in pixels."""
 
     suffix: str
     x: tuple[float, float]
@@ -152,12 +152,12 @@ def _draw_panel(figure: go.Figure, box: _Box, axes: _Axes) -> None:
     _draw_title_and_legend(figure, box, axes)
     for layer in box.panel.layers:
         if isinstance(layer, go.layout.Shape | go.layout.Annotation):
-            own = layer.to_plotly_json()
-            own |= {"xref": own["xref"].replace("x", x_name), "yref": own["yref"].replace("y", y_name)}
+            item = layer.to_plotly_json()
+            item |= {"xref": item["xref"].replace("x", x_name), "yref": item["yref"].replace("y", y_name)}
             if isinstance(layer, go.layout.Annotation):
-                figure.add_annotation(own)
+                figure.add_annotation(item)
             else:
-                figure.add_shape(own | ({"legend": legend} if layer.showlegend else {}))
+                figure.add_shape(item | ({"legend": legend} if layer.showlegend else {}))
             continue
         figure.add_trace(layer)
         trace = figure.data[-1]

@@ -41,12 +41,12 @@ def curves_so_far(rows: Sequence[Mapping[str, Any]]) -> Chart:
     for title, (unit, curves) in _CURVES.items():
         layers: list[Layer] = []
         for column, (name, color) in curves.items():
-            columns = [one for one in table if one == column or one.startswith(f"{column}/")]
+            columns = [key for key in table if key == column or key.startswith(f"{column}/")]
             # Not every iteration ends an episode on every track, or is evaluated.
             values = table[columns].astype(float).mean(axis=1).to_numpy()
-            known = np.isfinite(values)
-            if known.any():
-                layers.append(line(steps[known], values[known], color, name))
+            finite = np.isfinite(values)
+            if finite.any():
+                layers.append(line(steps[finite], values[finite], color, name))
         panels.append(Panel(title=title, y_label=unit, x_label="thousand control steps", layers=layers))
     return Chart(
         name="curves_so_far",
@@ -59,12 +59,12 @@ def curves_so_far(rows: Sequence[Mapping[str, Any]]) -> Chart:
 
 def newest_laps(shown: Sequence[TrackLines]) -> Chart:
     """Draw laps on their tracks, coloured by measured speed, on one scale."""
-    speeds = np.concatenate([one[:, 2] for here in shown for one in here.lines] or [np.zeros(1)])
+    speeds = np.concatenate([points[:, 2] for here in shown for points in here.lines] or [np.zeros(1)])
     # The few steps after a standing start would take half of the colours.
     colors = float(np.percentile(speeds, 5)), max(float(speeds.max()), float(np.percentile(speeds, 5)) + 0.1)
     panels = []
     for here in shown:
-        layers: list[Layer] = [line(one[:, 0], one[:, 1], PALE, width=1.0) for one in here.lines]
+        layers: list[Layer] = [line(points[:, 0], points[:, 1], PALE, width=1.0) for points in here.lines]
         if here.lines:
             x, y, speed_mps = np.concatenate(here.lines).T
             layers.append(colored_points(x, y, speed_mps, "speed, m/s", size=5.0, value_range=colors))

@@ -1,4 +1,4 @@
-"""Where the car drove, where episodes ended, and how likely it is to leave the road."""
+"""Maps of the rows driven, of the ends of episodes, and of the risk of leaving the road."""
 
 import numpy as np
 import pandas as pd
@@ -126,15 +126,15 @@ def off_track_risk(view: LogView) -> Chart | None:
     low, high = (100.0 * end for end in wilson(late_near_off, late_passes))
     share = 100.0 * near_off / np.where(near_passes > 0, near_passes, np.nan)
     late_share = 100.0 * late_near_off / np.where(late_passes > 0, late_passes, np.nan)
-    at, before = np.arange(n), off - late_off
+    x, before = np.arange(n), off - late_off
     risk: list[Layer] = [
-        band(at, low, high, VERMILION, "95% interval (Wilson)"),
-        line(at, share, PALE, "all iterations"),
-        line(at, late_share, VERMILION, "last third of the iterations"),
+        band(x, low, high, VERMILION, "95% interval (Wilson)"),
+        line(x, share, PALE, "all iterations"),
+        line(x, late_share, VERMILION, "last third of the iterations"),
     ]
     counts: list[Layer] = [
-        bars(at, before, PALE, f"off the road before ({before.sum():.0f})", width=1.0),
-        bars(at, late_off, VERMILION, f"in the last third ({late_off.sum():.0f})", base=before, width=1.0),
+        bars(x, before, PALE, f"off the road before ({before.sum():.0f})", width=1.0),
+        bars(x, late_off, VERMILION, f"in the last third ({late_off.sum():.0f})", base=before, width=1.0),
     ]
     label = f"risk within {PLACE_M / 2:g} m, %"
     rows = [[waypoint_panel(risk, label, n)], [waypoint_panel(counts, "episodes", n)]]

@@ -38,13 +38,13 @@ def proposed_actions_picture(title: str, proposal: ActionProposal) -> bytes:
         (False, "o", "chosen: centre of a cluster of commands"),
         (True, "s", "added to recover with"),
     ):
-        own = np.array(proposal.to_recover) == rescue
+        chosen = np.array(proposal.to_recover) == rescue
         axes.scatter(
-            listed[own, 0],
-            listed[own, 1],
-            s=area[own],
+            listed[chosen, 0],
+            listed[chosen, 1],
+            s=area[chosen],
             marker=marker,
-            color=colors[own],
+            color=colors[chosen],
             edgecolor=INK,
             linewidth=1.4,
             clip_on=False,

@@ -1,4 +1,4 @@
-"""What the reward function paid: by place, by waypoint, by its terms, by step and by episode."""
+"""The rewards that a function returned: by place, by waypoint, by its terms, by step and by episode."""
 
 import numpy as np
 import pandas as pd
@@ -103,7 +103,7 @@ def reward_by_waypoint(view: LogView) -> Chart | None:
     if not len(rows):
         return None
     n, waypoint, part = view.waypoint_count, closest_waypoints(rows), subsample(len(rows), MOST_ROWS)
-    at = np.arange(n)
+    waypoints = np.arange(n)
     panels = []
     for column, label in (
         ("reward", "reward of a step"),
@@ -113,11 +113,14 @@ def reward_by_waypoint(view: LogView) -> Chart | None:
         quarter, median, three_quarters = quantiles(waypoint[part], values[part], n, (0.25, 0.5, 0.75))
         ends = pd.Series(values).groupby(waypoint).agg(["max", "min"]).reindex(range(n))
         usual: list[Layer] = [
-            band(at, quarter, three_quarters, BLUE, "middle half"),
-            line(at, means(waypoint, values, n), INK, "mean", width=2.5),
-            line(at, median, ORANGE, "median", dashed=True, width=2.5),
+            band(waypoints, quarter, three_quarters, BLUE, "middle half"),
+            line(waypoints, means(waypoint, values, n), INK, "mean", width=2.5),
+            line(waypoints, median, ORANGE, "median", dashed=True, width=2.5),
         ]
-        extremes = [line(at, ends["max"], GREEN, "best"), line(at, ends["min"], VERMILION, "worst")]
+        extremes = [
+            line(waypoints, ends["max"], GREEN, "best"),
+            line(waypoints, ends["min"], VERMILION, "worst"),
+        ]
         panels += [waypoint_panel(usual, label, n), waypoint_panel(extremes, label, n)]
     return Chart(
         name="reward_by_waypoint",
@@ -140,8 +143,8 @@ def reward_terms(view: LogView, terms: pd.DataFrame) -> Chart | None:
     rows = view.steps.loc[terms.index]
     n, waypoint, iteration = view.waypoint_count, closest_waypoints(rows), rows["iteration"].to_numpy(np.intp)
     last = int(iteration.max()) + 1
-    known = np.unique(iteration)
-    at = np.arange(n)
+    iterations = np.unique(iteration)
+    waypoints = np.arange(n)
     by_waypoint: list[Layer] = []
     by_iteration: list[Layer] = []
     curves = [("sum of all", terms.sum(axis=1), PALE, 4.5)]
@@ -149,8 +152,8 @@ def reward_terms(view: LogView, terms: pd.DataFrame) -> Chart | None:
         words = f"{str(name).replace('_', ' ')} ({terms[name].mean():.3g})"
         curves.append((words, terms[name], CATEGORIES[number % len(CATEGORIES)], 2.0))
     for words, values, color, width in curves:
-        by_waypoint.append(line(at, means(waypoint, values, n), color, words, width=width))
-        by_iteration.append(line(known, means(iteration, values, last)[known], color, width=width))
+        by_waypoint.append(line(waypoints, means(waypoint, values, n), color, words, width=width))
+        by_iteration.append(line(iterations, means(iteration, values, last)[iterations], color, width=width))
     unit = "reward of a step"
     return Chart(
         name="reward_terms",
@@ -236,11 +239,11 @@ def scatter_time_reward(view: LogView) -> Chart | None:
         ("steps", "time_s", "control steps", "time of the episode, s"),
         ("lap_time_s", "reward", "lap time of complete laps, s", "reward of the lap"),
     ):
-        known = shown[shown[x].notna()]
+        rows = shown[shown[x].notna()]
         layers: list[Layer] = [
             points(some[x], some[y], color, name, size=5.0)
             for complete, name, color in ((False, "not complete", ORANGE), (True, "complete lap", BLUE))
-            if len(some := known[known["complete"] == complete])
+            if len(some := rows[rows["complete"] == complete])
         ]
         if layers:
             panels.append(Panel(x_label=x_label, y_label=y_label, layers=layers))
@@ -274,10 +277,10 @@ def discount_factors(view: LogView) -> Chart | None:
     logged = "discount_factor" in (view.recording.hyperparameters or {})
     whose = "this training" if logged else "the service's default"
     for gamma, color in zip(sorted({*GAMMAS, view.discount}), colors, strict=False):
-        own = gamma == view.discount
-        name = f"{gamma:g}{f' ({whose})' if own else ''}"
+        is_used = gamma == view.discount
+        name = f"{gamma:g}{f' ({whose})' if is_used else ''}"
         layers.append(
-            line(ahead, 100 * gamma**ahead, BLACK if own else color, name, width=3.2 if own else 1.75)
+            line(ahead, 100 * gamma**ahead, BLACK if is_used else color, name, width=3.2 if is_used else 1.75)
         )
     what = "the fastest lap" if complete else "the longest drive"
     layers.append(mark(count, f"{what}: {count} steps", FAINT, in_legend=True))

@@ -27,7 +27,7 @@ LINE_COLUMNS = (
 """Columns of a trace that `episodes` and `driven_lines` use."""
 ROAD, BORDER, CENTER, INK, FAINT = "#30343b", "#b9bfc8", "#6b727d", "#22262b", "#7b828c"
 SPEED = LinearSegmentedColormap.from_list("speed", ["#e0457b", "#f58f3c", "#ffe14d", "#7fe3a1", "#4fd6ff"])
-"""From slow to fast; every colour can be seen on the dark road."""
+"""Colours from slow to fast; every one can be seen on the dark road."""
 BLUE, ORANGE, GREEN, PURPLE = "#2f6fb5", "#d9822b", "#2e8b57", "#7a5195"
 MANY = [*matplotlib.color_sequences["tab20"][::2], *matplotlib.color_sequences["tab20"][1::2]]
 """Colours of the tracks of a run."""
@@ -98,23 +98,23 @@ class TrackLines:
 
 def lines_figure(shown: Sequence[TrackLines]) -> Figure:
     """Draw lines on their tracks, coloured by measured speed, on one scale."""
-    one = len(shown) == 1
+    single = len(shown) == 1
     columns = len(shown) if len(shown) <= 3 else math.ceil(math.sqrt(len(shown)))
     rows = math.ceil(len(shown) / columns)
     shape = 0.8
-    if one:
+    if single:
         low, high = Outline.of(shown[0].track).corners(_MARGIN_M)
         width_m, height_m = high - low
         shape = float(np.clip(height_m / width_m, 0.25, 0.9))
-    cell = (10.0 if one else 13.0) / columns  # inches
+    cell = (10.0 if single else 13.0) / columns  # inches
     figure = Figure((columns * cell, rows * (0.9 * shape * cell + 0.9)), dpi=150, layout=_LAYOUT)
     cells = figure.subplots(rows, columns, squeeze=False)
     lines = []
     for axes, here in zip(cells.flat, shown, strict=False):
         _draw_road(axes, here.track)
-        width = (3.0 if one else 1.8) / math.sqrt(max(len(here.lines), 1))
-        lines += [_draw_line(axes, line, width, arrow=11.0 if one else 7.0) for line in here.lines]
-        size = 11.0 if one else 8.5
+        width = (3.0 if single else 1.8) / math.sqrt(max(len(here.lines), 1))
+        lines += [_draw_line(axes, line, width, arrow=11.0 if single else 7.0) for line in here.lines]
+        size = 11.0 if single else 8.5
         axes.set_title(
             here.track.title, loc="left", fontsize=1.5 * size, fontweight="bold", color=INK, pad=2 * size
         )
@@ -194,15 +194,13 @@ def _curves(
     thin = {name: ("", MANY[number % len(MANY)]) for number, name in enumerate(of_tracks)}
     for name, (label, color) in (thin | dict(curves)).items():
         # Not every iteration ends an episode on every track.
-        known = metrics[metrics[name].notna()] if name in thin else metrics
-        if of_tracks and not known[name].notna().any():
+        rows = metrics[metrics[name].notna()] if name in thin else metrics
+        if of_tracks and not rows[name].notna().any():
             continue
         width = 0.8 if name in thin else 1.8
         # Dots as well where there are few, since a single point has no line.
         dots = "o" if name in curves and len(metrics) < 12 else ""
-        axes.plot(
-            known["env_steps"], known[name], color=color, linewidth=width, label=label, marker=dots, ms=4
-        )
+        axes.plot(rows["env_steps"], rows[name], color=color, linewidth=width, label=label, marker=dots, ms=4)
     if not metrics[[*thin, *curves]].notna().any(axis=None):
         axes.text(0.5, 0.5, "none yet", transform=axes.transAxes, ha="center", color=FAINT)
         axes.set_yticks([])

@@ -97,17 +97,17 @@ def _on_grid(iterations: pd.DataFrame, column: str, grid: Values) -> Values:
     """Return a column's moving average at numbers of control steps, NaN before its first and after its last value."""
     driven = iterations["steps"].to_numpy(np.float64).cumsum()
     values = moving_average(iterations[column].to_numpy(np.float64))
-    known = np.isfinite(values)
-    if not known.any():
+    finite = np.isfinite(values)
+    if not finite.any():
         return np.full(len(grid), np.nan)
-    return np.interp(grid, driven[known], values[known], left=np.nan, right=np.nan)
+    return np.interp(grid, driven[finite], values[finite], left=np.nan, right=np.nan)
 
 
 def _best_laps(groups: Mapping[str, Sequence[LogView]]) -> list[Panel]:
     best_s = [[float(view.episodes["lap_time_s"].min()) for view in some] for some in groups.values()]
     if not np.isfinite(np.concatenate(best_s)).any():
         return []
-    places = [at + 0.5 * ((np.arange(len(own)) + 0.5) / len(own) - 0.5) for at, own in enumerate(best_s)]
+    places = [x + 0.5 * ((np.arange(len(laps)) + 0.5) / len(laps) - 0.5) for x, laps in enumerate(best_s)]
     n = len(groups)
     layers = [
         # Below the points, which it may coincide with.
@@ -127,11 +127,11 @@ def generations(views: Sequence[LogView]) -> Chart | None:
         if not len(table):
             continue
         first = int(table["iteration"].min())
-        starts = [(one.first_iteration, one.name) for one in view.recording.rounds]
+        starts = [(part.first_iteration, part.name) for part in view.recording.rounds]
         starts = starts or [(first, group_name(view.name))]
         number = np.searchsorted([start for start, _ in starts[1:]], table["iteration"], "right")
         moved = table.assign(iteration=table["iteration"] + offset - first)
-        parts += [(name, moved[number == at]) for at, (_, name) in enumerate(starts)]
+        parts += [(name, moved[number == index]) for index, (_, name) in enumerate(starts)]
         offset = int(moved["iteration"].max()) + 1
     if len(parts) < 2:
         return None
@@ -179,17 +179,17 @@ def generalisation_matrix(driven: Sequence[tuple[str, str | None, Mapping[str, f
     Args:
         driven: of each policy its name, the track it was trained on, and its mean completion, per cent, by track.
     """
-    driven = [one for one in driven if one[2]]
+    driven = [row for row in driven if row[2]]
     tracks = list(dict.fromkeys(track for _, _, results in driven for track in results))
     if len(tracks) < 2:
         return None
     labels = [
         f"{group_name(name)}, trained on {trained or 'an unknown track'}" for name, trained, _ in driven
     ]
-    names = [label if labels.count(label) == 1 else f"{label} ({at + 1})" for at, label in enumerate(labels)]
+    names = [label if labels.count(label) == 1 else f"{label} ({k + 1})" for k, label in enumerate(labels)]
     matrix = np.array([[results.get(track, np.nan) for track in tracks] for _, _, results in driven])
-    scale, at = "completion, per cent", (np.arange(len(tracks)), np.arange(len(names)))
-    cells = heatmap(*at, matrix, scale, written=True, value_range=(0.0, 100.0))
+    scale, places = "completion, per cent", (np.arange(len(tracks)), np.arange(len(names)))
+    cells = heatmap(*places, matrix, scale, written=True, value_range=(0.0, 100.0))
     foreign = np.array([[track != trained for track in tracks] for _, trained, _ in driven])
     away = matrix[foreign & np.isfinite(matrix)]
     words = (
@@ -213,9 +213,9 @@ def policy_of(view: LogView) -> tuple[str, str | None, dict[str, float]]:
     steps = view.recording.steps
     raced = steps[steps["stream"].astype(str) != "training"].astype({"track": str, "stream": str})
     episodes = raced.groupby(["track", "stream", "episode"])["progress"].max()
-    found: dict[str, float] = episodes.groupby("track").mean().to_dict()
+    by_track: dict[str, float] = episodes.groupby("track").mean().to_dict()
     folder = run_folder(view)
-    return view.name, view.track_name, found | (stored_completion(folder) if folder is not None else {})
+    return view.name, view.track_name, by_track | (stored_completion(folder) if folder is not None else {})
 
 
 def stored_completion(run: Path) -> dict[str, float]:
@@ -223,15 +223,15 @@ def stored_completion(run: Path) -> dict[str, float]:
 
     Files that are no evaluation are left out.
     """
-    found: dict[str, float] = {}
+    by_track: dict[str, float] = {}
     for file in sorted((run / EVALUATIONS).glob("*.json")):
         try:
             groups: list[dict[str, Any]] = json.loads(file.read_text(encoding="utf-8"))["groups"]
             usual = [group for group in groups if group["condition"] == "usual"]
-            found |= {str(group["track"]): float(group["completion"]["mean"]) for group in usual}
+            by_track |= {str(group["track"]): float(group["completion"]["mean"]) for group in usual}
         except (OSError, ValueError, TypeError, KeyError):
             continue
-    return found
+    return by_track
 
 
 def evaluated_laps(checkpoints: pd.DataFrame) -> Chart | None:
@@ -240,12 +240,10 @@ def evaluated_laps(checkpoints: pd.DataFrame) -> Chart | None:
     `checkpoints` has a row each, the oldest first: `name`, and `laps_s`, the times of its complete laps on the usual
     conditions, s.
     """
-    laps_s = [np.asarray(one, np.float64) for one in checkpoints["laps_s"]]
+    laps_s = [np.asarray(times_s, np.float64) for times_s in checkpoints["laps_s"]]
     if not sum(map(len, laps_s)):
         return None
-    x = [
-        at + 0.5 * ((np.arange(len(some)) + 0.5) / max(len(some), 1) - 0.5) for at, some in enumerate(laps_s)
-    ]
+    x = [x + 0.5 * ((np.arange(len(some)) + 0.5) / max(len(some), 1) - 0.5) for x, some in enumerate(laps_s)]
     medians = [float(np.median(some)) if len(some) else np.nan for some in laps_s]
     panel = Panel(
         layers=[
@@ -275,22 +273,24 @@ def speed_and_stability(checkpoints: pd.DataFrame, recommended: str) -> Chart:
         recommended: name of the one with a ring.
     """
     layers: list[Layer] = []
-    for number, one in enumerate(checkpoints.itertuples()):
-        color, x = CATEGORIES[number % len(CATEGORIES)], one.lap_time_s
-        if np.isfinite(one.held_out_lap_time_s):
-            away, share = one.held_out_lap_time_s, one.held_out_complete
-            between = np.linspace(x, away, 3), np.linspace(one.complete, share, 3)
+    for number, checkpoint in enumerate(checkpoints.itertuples()):
+        color, x = CATEGORIES[number % len(CATEGORIES)], checkpoint.lap_time_s
+        if np.isfinite(checkpoint.held_out_lap_time_s):
+            away, share = checkpoint.held_out_lap_time_s, checkpoint.held_out_complete
+            between = np.linspace(x, away, 3), np.linspace(checkpoint.complete, share, 3)
             layers.append(line(*between, color, width=1.0))
             layers.append(points([away], [share], color, size=9, symbol="circle-open"))
-        layers.append(line([x, x, x], [one.low, one.complete, one.high], color))
-        if one.name == recommended:
+        layers.append(line([x, x, x], [checkpoint.low, checkpoint.complete, checkpoint.high], color))
+        if checkpoint.name == recommended:
             ring = f"recommended: {recommended}"
-            layers.append(points([x], [one.complete], INK, ring, size=20, symbol="circle-open"))
+            layers.append(points([x], [checkpoint.complete], INK, ring, size=20, symbol="circle-open"))
         # Lap times are multiples of the control period, so that points coincide: the older ones are larger.
         later = checkpoints.iloc[number + 1 :]
-        above = ((later["lap_time_s"] == x) & (later["complete"] == one.complete)).sum()
-        words = "  ".join(filter(None, [one.name, one.labels, "" if np.isfinite(x) else "no lap"]))
-        layers.append(points([x], [one.complete], color, words, size=8 + 5 * above))
+        above = ((later["lap_time_s"] == x) & (later["complete"] == checkpoint.complete)).sum()
+        words = "  ".join(
+            filter(None, [checkpoint.name, checkpoint.labels, "" if np.isfinite(x) else "no lap"])
+        )
+        layers.append(points([x], [checkpoint.complete], color, words, size=8 + 5 * above))
     times_s = checkpoints[["lap_time_s", "held_out_lap_time_s"]].to_numpy(np.float64)
     times_s = times_s[np.isfinite(times_s)]
     x_range = (0.0, 1.0)

@@ -1,4 +1,4 @@
-"""How a training went: its progress, its quarters, its updates beside lap times, its stability, its evaluations."""
+"""Charts of a training: its progress, its quarters, its updates beside lap times, its stability, its evaluations."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -23,9 +23,9 @@ def training_progress(view: LogView) -> Chart | None:
     table = view.iterations
     if not len(table):
         return None
-    found = convergence(table, view.action_count, view.stopping)
-    at = None if found is None else found.iteration
-    converged = [] if at is None else [mark(at, "converged", FAINT)]
+    verdict = convergence(table, view.action_count, view.stopping)
+    iteration = None if verdict is None else verdict.iteration
+    converged = [] if iteration is None else [mark(iteration, "converged", FAINT)]
     progress = curve_layers(table, "completion_mean", BLUE, "mean of the episodes")
     for column, color, name in (
         ("eval_completion", ORANGE, "evaluation after the update"),
@@ -54,10 +54,10 @@ def training_progress(view: LogView) -> Chart | None:
         shown.append(
             ("Entropy of the policy", "nats", curve_layers(table, "entropy", PURPLE, "mean over the update"))
         )
-    when = "It has not converged yet." if at is None else f"It converged at iteration {at}."
+    when = "It has not converged yet." if iteration is None else f"It converged at iteration {iteration}."
     if view.decision is not None:
         when = "The run's stopping rule ended it."
-    elif found is None:
+    elif verdict is None:
         when = "It is too short to say whether it has converged."
     return Chart(
         name="training_progress",
@@ -80,17 +80,17 @@ def learning_vs_lap_time(view: LogView) -> Chart | None:
         "lr": ("Learning rate", "rate", FAINT),
     }
     # A learning rate that does not change says nothing.
-    known = [name for name in metrics if table[name].nunique() > (name == "lr")]
-    if not known or not table["lap_time_mean_s"].notna().any():
+    changing = [name for name in metrics if table[name].nunique() > (name == "lr")]
+    if not changing or not table["lap_time_mean_s"].notna().any():
         return None
     laps = [
         *_joined(table, "lap_time_p25_s", GREEN, "25th percentile"),
         *_joined(table, "lap_time_best_s", BLUE, "best"),
     ]
     panels = [Panel(title="Exploring laps", y_label="lap time, s", layers=laps)]
-    for name in known:
+    for name in changing:
         title, unit, color = metrics[name]
-        label = ITERATION if name == known[-1] else ""
+        label = ITERATION if name == changing[-1] else ""
         panels.append(
             Panel(title=title, x_label=label, y_label=unit, layers=curve_layers(table, name, color, None))
         )
@@ -110,12 +110,12 @@ def quarters(view: LogView) -> Chart | None:
     if len(episodes) < 4:
         return None
     groups = episodes.groupby("quarter")
-    at = np.array(list(groups.groups)) - 1
+    places = np.array(list(groups.groups)) - 1
     complete = groups["complete"].sum()
     shown: list[tuple[str, str, list[Layer]]] = [
-        ("Progress, mean", "per cent of the lap", [bars(at, groups["progress"].mean(), BLUE)]),
-        ("Complete laps", "per cent of the episodes", [bars(at, 100 * groups["complete"].mean(), GREEN)]),
-        ("Reward, mean", "reward of an episode", [bars(at, groups["reward"].mean(), SKY)]),
+        ("Progress, mean", "per cent of the lap", [bars(places, groups["progress"].mean(), BLUE)]),
+        ("Complete laps", "per cent of the episodes", [bars(places, 100 * groups["complete"].mean(), GREEN)]),
+        ("Reward, mean", "reward of an episode", [bars(places, groups["reward"].mean(), SKY)]),
     ]
     laps = episodes[episodes["lap_time_s"].notna()]
     if len(laps):
@@ -124,8 +124,8 @@ def quarters(view: LogView) -> Chart | None:
         within = laps.groupby("quarter").cumcount() / laps.groupby("quarter")["quarter"].transform("size")
         times: list[Layer] = [
             points(laps["quarter"] - 1 + 0.7 * (within - 0.5), laps["lap_time_s"], SKY, size=5),
-            points(at, groups["lap_time_s"].mean(), BLUE, "mean", size=11, symbol="diamond"),
-            points(at, groups["lap_time_s"].min(), VERMILION, "best", size=12, symbol="star"),
+            points(places, groups["lap_time_s"].mean(), BLUE, "mean", size=11, symbol="diamond"),
+            points(places, groups["lap_time_s"].min(), VERMILION, "best", size=12, symbol="star"),
         ]
         shown.append(("Lap times, in their order", "lap time, s", times))
     axis: dict[str, Any] = {
@@ -150,7 +150,7 @@ def evaluations(view: LogView) -> Chart | None:
     if not len(episodes):
         return None
     names = [str(name) for name in dict.fromkeys(episodes["stream"])]
-    number = episodes["stream"].astype(str).map({name: at for at, name in enumerate(names)})
+    number = episodes["stream"].astype(str).map({name: index for index, name in enumerate(names)})
     # Side by side, so that equal results do not cover each other.
     order, size = number.groupby(number).cumcount(), number.groupby(number).transform("size")
     x = number + 0.7 * ((order + 0.5) / size - 0.5)
@@ -204,7 +204,7 @@ def stability(view: LogView) -> Chart | None:
     lengths = histogram(np.minimum(times_ms, np.percentile(times_ms, 99.9)), least=20)
     count = int(view.steps["iteration"].max()) + 1
     high, middle = quantiles(driven["iteration"].to_numpy(), times_ms, count, (0.95, 0.5))
-    at = np.flatnonzero(np.isfinite(middle))
+    measured = np.flatnonzero(np.isfinite(middle))
     panels = [
         Panel(
             title="Length of a control step",
@@ -222,8 +222,8 @@ def stability(view: LogView) -> Chart | None:
             x_label=ITERATION,
             y_label="ms",
             layers=[
-                line(at, high[at], ORANGE, "95th percentile"),
-                line(at, middle[at], BLUE, "median"),
+                line(measured, high[measured], ORANGE, "95th percentile"),
+                line(measured, middle[measured], BLUE, "median"),
                 mark(_TOO_LONG_MS, "too long", VERMILION, horizontal=True),
             ],
             y_range=(0.0, max(1.15 * _TOO_LONG_MS, 1.05 * float(np.nanmax(high)))),
@@ -237,11 +237,11 @@ def stability(view: LogView) -> Chart | None:
         low, middle, high = quantiles(
             episodes["iteration"].to_numpy(), episodes[column], count, (0.25, 0.5, 0.75)
         )
-        at = np.flatnonzero(np.isfinite(middle))
-        if len(at):
+        measured = np.flatnonzero(np.isfinite(middle))
+        if len(measured):
             layers = [
-                band(at, low[at], high[at], color, "middle half"),
-                line(at, middle[at], color, "median"),
+                band(measured, low[measured], high[measured], color, "middle half"),
+                line(measured, middle[measured], color, "median"),
             ]
             panels.append(_over_iterations(title, unit, layers))
     healthy = 100 * float((times_ms <= _TOO_LONG_MS).mean())
@@ -267,8 +267,8 @@ def curve_layers(table: pd.DataFrame, column: str, color: str, name: str | None)
 
 def _joined(table: pd.DataFrame, column: str, color: str, name: str) -> list[Layer]:
     """Return the known values of a column as points joined by a thin line."""
-    known = table[table[column].notna()]
-    x, y = known["iteration"], known[column]
+    rows = table[table[column].notna()]
+    x, y = rows["iteration"], rows[column]
     return [line(x, y, color, width=1.0), points(x, y, color, name, size=5.5)]
 
 

@@ -35,8 +35,8 @@ class Blocks:
         rest, skipping = b"", False
         for chunk in self._chunks():
             if skipping:
-                _, found, chunk = chunk.partition(b"\n")
-                if not found:
+                _, separator, chunk = chunk.partition(b"\n")
+                if not separator:
                     continue
                 skipping = False
                 self.lines += 1

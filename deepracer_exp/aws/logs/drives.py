@@ -77,15 +77,15 @@ def iterations_of(table: pa.Table, log: TrainingLog, episodes_per_iteration: int
         )
     if not any(log.iteration_of.values()):
         return episode // _episodes_between(log, episodes_per_iteration)
-    known = np.array(sorted(log.iteration_of))
-    logged = np.array([log.iteration_of[number] for number in known.tolist()], np.int64)
-    place = np.searchsorted(known, episode)
+    logged_episodes = np.array(sorted(log.iteration_of))
+    logged = np.array([log.iteration_of[number] for number in logged_episodes.tolist()], np.int64)
+    place = np.searchsorted(logged_episodes, episode)
     # Episodes after the last logged one were not finished when the log ended.
     counts = np.unique(logged, return_counts=True)[1]
     usual = int(counts[:-1].max()) if len(counts) > 1 else episodes_per_iteration
-    behind = episode - known[-1] - (usual - int(counts[-1]))
+    behind = episode - logged_episodes[-1] - (usual - int(counts[-1]))
     beyond = logged[-1] + np.where(behind > 0, 1 + (behind - 1) // usual, 0)
-    return np.where(place < len(known), logged[np.minimum(place, len(known) - 1)], beyond)
+    return np.where(place < len(logged_episodes), logged[np.minimum(place, len(logged_episodes) - 1)], beyond)
 
 
 def checkpoint_number(name: str) -> int:
@@ -158,9 +158,9 @@ def number_episodes(
     if not len(raw):
         return raw, {}
     alone = rounds[-1] == rounds[0] and bool((worker == worker[0]).all())
-    own = {(int(rounds[0]), int(worker[0]), int(one)): int(one) for one in np.unique(raw)}
+    unchanged = {(int(rounds[0]), int(worker[0]), int(episode)): int(episode) for episode in np.unique(raw)}
     if alone and _rises((raw << 32) | steps):
-        return raw, own
+        return raw, unchanged
     new = np.ones(len(raw), np.bool_)
     new[1:] = (np.diff(rounds) != 0) | (np.diff(worker) != 0) | (np.diff(raw) != 0) | (np.diff(steps) <= 0)
     drive = np.cumsum(new) - 1
@@ -175,7 +175,7 @@ def number_episodes(
     )
     table["again"] = table["again"].clip(lower=1)
     if alone and (table["again"] == 1).all():
-        return raw, own
+        return raw, unchanged
     by = ["rounds", "iteration", "worker", "raw", "again"]
     # An episode that continues into the next iteration belongs to the first.
     table["iteration"] = table.groupby(["rounds", "worker", "raw", "again"])["iteration"].transform("min")
@@ -211,7 +211,7 @@ def steps_of(parts: Sequence[Rows]) -> pd.DataFrame:
     tracks = list(dict.fromkeys(name for part in parts for name in part.track))
     codes = [np.array([tracks.index(name) for name in part.track])[part.track_code] for part in parts]
     status = table["episode_status"].chunk(0) if table.num_rows else None
-    own: dict[str, Any] = {
+    first_columns: dict[str, Any] = {
         "stream": pd.Categorical.from_codes(
             np.repeat(np.arange(len(parts)), sizes), [part.stream for part in parts]
         ),
@@ -226,7 +226,7 @@ def steps_of(parts: Sequence[Rows]) -> pd.DataFrame:
     }
     columns = {}
     for name, (kind, _) in STEP_COLUMNS.items():
-        values = own[name] if name in own else table[name].to_numpy()
+        values = first_columns[name] if name in first_columns else table[name].to_numpy()
         columns[name] = values if kind == "category" else values.astype(kind, copy=False)
     return pd.DataFrame(columns, copy=False)
 

@@ -53,7 +53,7 @@ class LogFile:
     """One file, wherever it is."""
 
     path: Path
-    """For messages; a member of an archive has a path below the archive's."""
+    """Path for messages; a member of an archive has a path below the archive's."""
     parts: tuple[str, ...]
     """Names of the folders it is in, as far as they matter, and its own name."""
     opener: Callable[..., IO[bytes]]
@@ -88,7 +88,7 @@ class LogFolder:
     """The files found in a folder or an archive."""
 
     files: list[LogFile] = field(default_factory=list)
-    """In the order in which they are fastest to read."""
+    """Files in the order in which they are fastest to read."""
     problems: list[LogProblem] = field(default_factory=list)
 
 
@@ -112,10 +112,10 @@ def named_parts(path: Path) -> tuple[str, ...]:
 
 def place_of(parts: tuple[str, ...]) -> Place:
     """Return the job of a trace or log, by its folders and its name."""
-    for at in range(len(parts) - 2, -1, -1):
-        if parts[at] in ("training-simtrace", "evaluation-simtrace"):
-            kind = parts[at].partition("-")[0]
-            above = parts[:at]
+    for depth in range(len(parts) - 2, -1, -1):
+        if parts[depth] in ("training-simtrace", "evaluation-simtrace"):
+            kind = parts[depth].partition("-")[0]
+            above = parts[:depth]
             worker = 0
             numbered = _WORKER_FOLDER.fullmatch(above[-1]) if kind == "training" and above else None
             if numbered:
@@ -144,8 +144,8 @@ def label(name: str) -> str:
 
 def without_worker(name: str) -> str:
     """Return the name of a log with # for the number of its worker: the same for all workers of a training."""
-    found = _WORKER.search(name)
-    return name if found is None else f"{name[: found.start(1)]}#{name[found.end(1) :]}"
+    match = _WORKER.search(name)
+    return name if match is None else f"{name[: match.start(1)]}#{name[match.end(1) :]}"
 
 
 def same_job(one: str, other: str) -> bool:
@@ -174,10 +174,10 @@ def log_folder(path: Path) -> Iterator[LogFolder]:
             if stat.S_ISDIR(mode):
                 yield _walk(path, opened)
             elif _is_packed(path):
-                found = LogFolder()
+                listed = LogFolder()
                 archives = opened.enter_context(contextlib.closing(_Archives()))
-                _unpack(found, path, (), named_parts(path)[-3:-1], archives)
-                yield found
+                _unpack(listed, path, (), named_parts(path)[-3:-1], archives)
+                yield listed
             else:
                 yield LogFolder([_plain(path, named_parts(path)[-3:])])
     except FileNotFoundError as error:
@@ -189,7 +189,7 @@ def log_folder(path: Path) -> Iterator[LogFolder]:
 
 
 def _walk(root: Path, opened: contextlib.ExitStack) -> LogFolder:
-    found = LogFolder()
+    listed = LogFolder()
     above = root.resolve().parts[-2:]
     waiting, packed = [root], []
     while waiting:
@@ -197,30 +197,30 @@ def _walk(root: Path, opened: contextlib.ExitStack) -> LogFolder:
         try:
             entries = list(folder.iterdir())
         except OSError as error:
-            found.problems.append(LogProblem(str(folder), None, f"cannot be read: {error.strerror}"))
+            listed.problems.append(LogProblem(str(folder), None, f"cannot be read: {error.strerror}"))
             continue
         for entry in entries:
             if entry.is_symlink():
-                found.problems.append(LogProblem(str(entry), None, "a link; not followed"))
+                listed.problems.append(LogProblem(str(entry), None, "a link; not followed"))
             elif entry.is_dir():
                 waiting.append(entry)
             elif entry.is_file() and PACKED.search(entry.name):
                 packed.append(entry)
             elif entry.is_file():
-                found.files.append(_plain(entry, (*above, *entry.relative_to(root).parts)))
-    found.files.sort(key=lambda file: file.order)
+                listed.files.append(_plain(entry, (*above, *entry.relative_to(root).parts)))
+    listed.files.sort(key=lambda file: file.order)
     archives = opened.enter_context(contextlib.closing(_Archives()))
     for path in sorted(packed):
         folders = (*above, *path.relative_to(root).parts[:-1])
         plain = path.with_name(PACKED.sub("", path.name))
         try:
             if plain.is_file():
-                found.problems.append(LogProblem(str(path), None, f"not read: {plain.name} lies beside it"))
+                listed.problems.append(LogProblem(str(path), None, f"not read: {plain.name} lies beside it"))
             else:
-                _unpack(found, path, (*folders, path.name), folders, archives)
+                _unpack(listed, path, (*folders, path.name), folders, archives)
         except (*READ_ERRORS, ValueError) as error:
-            found.problems.append(LogProblem(str(path), None, f"cannot be read ({reason_of(error)})"))
-    return found
+            listed.problems.append(LogProblem(str(path), None, f"cannot be read ({reason_of(error)})"))
+    return listed
 
 
 def _plain(path: Path, parts: tuple[str, ...]) -> LogFile:
@@ -256,12 +256,12 @@ class _Archives:
 
 
 def _unpack(
-    found: LogFolder, path: Path, inside: tuple[str, ...], beside: tuple[str, ...], archives: _Archives
+    listed: LogFolder, path: Path, inside: tuple[str, ...], beside: tuple[str, ...], archives: _Archives
 ) -> None:
     """Add the members of an archive, or a compressed file.
 
     Args:
-        found: the files to add to.
+        listed: the files to add to.
         path: path of the archive or compressed file.
         inside: folders that the members are in; empty if the archive is all there is.
         beside: folders that the archive or compressed file is in.
@@ -281,19 +281,19 @@ def _unpack(
             raise OSError("neither an archive nor compressed" if head else "empty") from None
         with opener(path) as stream:
             stream.read(1)
-        found.files.append(LogFile(path, (*beside, PACKED.sub("", path.name)), opener, (path,)))
+        listed.files.append(LogFile(path, (*beside, PACKED.sub("", path.name)), opener, (path,)))
         return
     if inside and not any(map(_may_hold_data, members.files)):
-        found.problems += members.problems
-        found.files.append(_plain(path, (*beside, path.name)))  # perhaps a model for the car
+        listed.problems += members.problems
+        listed.files.append(_plain(path, (*beside, path.name)))  # perhaps a model for the car
         return
-    found.problems += members.problems
+    listed.problems += members.problems
     rest = [file for file in members.files if not inside or not _lies_beside(path, file)]
     if len(rest) < len(members.files):
         count = len(members.files) - len(rest)
         reason = f"{count} of {len(members.files)} files are not read: the same are unpacked beside it"
-        found.problems.append(LogProblem(str(path), None, reason))
-    found.files += [replace(file, parts=(*inside, *file.parts)) for file in rest]
+        listed.problems.append(LogProblem(str(path), None, reason))
+    listed.files += [replace(file, parts=(*inside, *file.parts)) for file in rest]
 
 
 def _lies_beside(path: Path, file: LogFile) -> bool:
@@ -326,7 +326,7 @@ def _ending(name: str) -> str | None:
 
 def _members(path: Path, archive: Archive, archives: _Archives) -> LogFolder:
     """List the members."""
-    found = LogFolder()
+    listed = LogFolder()
     members: dict[tuple[str, ...], ArchiveMember] = {}
     try:
         for member in members_of(archive):
@@ -337,12 +337,12 @@ def _members(path: Path, archive: Archive, archives: _Archives) -> LogFolder:
                 members.pop(parts, None)
                 members[parts] = member  # the later one counts, as in unpacking
             elif member.kind == "link":
-                found.problems.append(LogProblem(f"{path}/{member.name}", None, "a link; not followed"))
+                listed.problems.append(LogProblem(f"{path}/{member.name}", None, "a link; not followed"))
     except (*READ_ERRORS, ValueError, OverflowError) as error:
         reason = f"cannot be read to its end ({reason_of(error)})"
-        found.problems.append(LogProblem(str(path), None, reason))
+        listed.problems.append(LogProblem(str(path), None, reason))
     for parts, member in members.items():
         if parts:
             plain = parts if _ending(parts[-1]) is None else (*parts[:-1], PACKED.sub("", parts[-1]))
-            found.files.append(LogFile(path.joinpath(*parts), plain, archives.open, (path, member)))
-    return found
+            listed.files.append(LogFile(path.joinpath(*parts), plain, archives.open, (path, member)))
+    return listed

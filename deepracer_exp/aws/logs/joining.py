@@ -50,11 +50,11 @@ class JoinedSteps:
         self.copies: dict[tuple[str, ...], Drives] = {}
         # A log of 2019 repeats lines of the training's under the name of an evaluation.
         for number in sorted(
-            range(len(self.logs)), key=lambda at: log_place(*self.logs[at]).kind != TRAINING
+            range(len(self.logs)), key=lambda index: log_place(*self.logs[index]).kind != TRAINING
         ):
             self._add_log(number, *self.logs[number])
-        for one in self.drives:
-            one.place = replace(one.place, root=self._jobs.get(one.place.root, one.place.root))
+        for drives in self.drives:
+            drives.place = replace(drives.place, root=self._jobs.get(drives.place.root, drives.place.root))
         self.roots = {number: self._jobs.get(root, root) for number, root in self.roots.items()}
         self._without_copies()
         self._without_repeats()
@@ -125,9 +125,11 @@ class JoinedSteps:
 
     def _add_rest(self, file: LogFile, rest: Drives, root: tuple[str, ...], finished: Ints) -> None:
         """Add the finished iterations that only the log contains."""
-        others = [one for one in self.drives if one.place.root == root and one.place.kind == rest.place.kind]
-        known = np.unique(np.concatenate([one.iteration for one in others]))
-        whole = ~np.isin(rest.iteration, known) & np.isin(rest.iteration, finished)
+        others = [
+            part for part in self.drives if (part.place.root, part.place.kind) == (root, rest.place.kind)
+        ]
+        present = np.unique(np.concatenate([drives.iteration for drives in others]))
+        whole = ~np.isin(rest.iteration, present) & np.isin(rest.iteration, finished)
         if rest.place.kind == TRAINING and whole.any():
             more, into = rest.choose(whole), others[0]
             iteration = np.concatenate([into.iteration, more.iteration])
@@ -146,24 +148,24 @@ class JoinedSteps:
 
     def _without_copies(self) -> None:
         """Leave out drives that occur twice, as with a copy of a folder."""
-        known: dict[tuple[str, bytes, bytes], Drives] = {}
-        for one in list(self.drives):
-            times = one.table["tstamp"].to_numpy()
-            first = known.setdefault((one.place.kind, one.key.tobytes(), times.tobytes()), one)
-            if first is not one and len(times):
+        seen: dict[tuple[str, bytes, bytes], Drives] = {}
+        for drives in list(self.drives):
+            times = drives.table["tstamp"].to_numpy()
+            first = seen.setdefault((drives.place.kind, drives.key.tobytes(), times.tobytes()), drives)
+            if first is not drives and len(times):
                 reason = f"{len(times)} steps are left out: copies of {'/'.join(first.place.root)}"
-                self.problems.append(LogProblem("/".join(one.place.root), None, reason, lines=len(times)))
-                self.drives.remove(one)
-                self.copies[one.place.root] = one
+                self.problems.append(LogProblem("/".join(drives.place.root), None, reason, lines=len(times)))
+                self.drives.remove(drives)
+                self.copies[drives.place.root] = drives
 
     def _without_repeats(self) -> None:
-        for number, one in enumerate(self.drives):
-            twice = repeated(one)
+        for number, drives in enumerate(self.drives):
+            twice = repeated(drives)
             if twice.any():
                 count = int(twice.sum())
                 reason = f"{count} rows are left out: they are there twice"
-                self.problems.append(LogProblem("/".join(one.place.root), None, reason, lines=count))
-                self.drives[number] = one.choose(~twice)
+                self.problems.append(LogProblem("/".join(drives.place.root), None, reason, lines=count))
+                self.drives[number] = drives.choose(~twice)
 
 
 def log_place(files: Sequence[LogFile], log: TrainingLog) -> Place:
@@ -180,15 +182,15 @@ def _finished(log: Drives) -> Ints:
     """
     iterations = np.unique(log.iteration)
     done = log.table["done"].to_numpy()
-    counts = [int(done[log.iteration == one].sum()) for one in iterations[-2:]]
+    counts = [int(done[log.iteration == iteration].sum()) for iteration in iterations[-2:]]
     return iterations if len(counts) > 1 and counts[1] >= _NEARLY * counts[0] else iterations[:-1]
 
 
-def uppermost(found: Sequence[tuple[LogFile, Any]]) -> Any:
+def uppermost(files: Sequence[tuple[LogFile, Any]]) -> Any:
     """Return the content of the file nearest to the top; settings precede logs, a training's precede others."""
 
-    def rank(one: tuple[LogFile, Any]) -> tuple[bool, bool, int]:
-        parts = one[0].parts
-        return not one[0].name.endswith((".json", ".py")), place_of(parts).kind != TRAINING, len(parts)
+    def rank(entry: tuple[LogFile, Any]) -> tuple[bool, bool, int]:
+        parts = entry[0].parts
+        return not entry[0].name.endswith((".json", ".py")), place_of(parts).kind != TRAINING, len(parts)
 
-    return min(found, key=rank)[1] if found else None
+    return min(files, key=rank)[1] if files else None

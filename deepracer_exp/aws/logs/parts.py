@@ -74,7 +74,7 @@ class Parts:
         """Add the steps of a file; `age` sorts the files of one worker."""
         # Those of logs precede those of CSVs, which have more digits.
         key = (place.kind != TRAINING, is_csv, natural("/".join(place.root)), age, place.worker, file.order)
-        bisect.insort(self.steps, (key, file, steps), key=lambda one: one[0])
+        bisect.insort(self.steps, (key, file, steps), key=lambda entry: entry[0])
 
     def drop_first_steps(self) -> None:
         """Drop the first steps of all files while there are too many."""
@@ -103,15 +103,15 @@ def read_parts(folder: LogFolder) -> Parts:
     for file in folder.files:
         listed = len(parts.problems)
         try:
-            known = _read(parts, file, alone)
+            recognised = _read(parts, file, alone)
         except (ValueError, *READ_ERRORS) as error:
-            known = False
+            recognised = False
             reason = error.without(file.path) if isinstance(error, BadInput) else reason_of(error)
             if isinstance(error, READ_ERRORS):
                 reason = f"cannot be read ({reason})"
             parts.problems.append(LogProblem(str(file.path), None, reason))
         parts.drop_first_steps()
-        if known:
+        if recognised:
             parts.files.append(file)
         elif len(parts.problems) == listed and not _BESIDE.fullmatch(file.name):
             others.append(file)
@@ -163,8 +163,8 @@ def _read_csv(parts: Parts, file: LogFile) -> bool:
         except ValueError as error:
             reason, is_empty = str(error), not file.head(SETTINGS_BYTES).strip()
         else:
-            found = _NUMBER.search(file.name)
-            number, place = int(found[1]) if found else None, place_of(file.parts)
+            match = _NUMBER.search(file.name)
+            number, place = int(match[1]) if match else None, place_of(file.parts)
             parts.traces.append(TraceFile(file, place, number, steps))
             parts.add_steps(file, place, True, number or 0, steps)
             parts.refuse(file, refused)
@@ -200,9 +200,9 @@ def _read_log(parts: Parts, file: LogFile) -> bool:
 def _read_hyperparameters(parts: Parts, file: LogFile, raw: bytes) -> None:
     """Add the values that the file gives; those that cannot be used are listed as problems."""
     refused: list[str] = []
-    known = read_hyperparameters(file.path, raw, refused)
+    settings = read_hyperparameters(file.path, raw, refused)
     parts.hyperparameters.append(
-        (file, {key: getattr(known, key) for key in known.given if hasattr(known, key)})
+        (file, {key: getattr(settings, key) for key in settings.given if hasattr(settings, key)})
     )
     parts.refuse(file, [(None, f"hyperparameters: {reason}") for reason in refused])
 

@@ -93,9 +93,9 @@ class _Assembly:
         self.roots, self.copies = joined.roots, joined.copies
         self.iteration_of: dict[int, int] = {}
         """Iteration of each training episode of the recording."""
-        self.training = [one for one in self.drives if one.place.kind == TRAINING]
+        self.training = [drives for drives in self.drives if drives.place.kind == TRAINING]
         self.rounds = sorted(
-            {one.place.root for one in self.training}, key=lambda root: natural("/".join(root))
+            {drives.place.root for drives in self.training}, key=lambda root: natural("/".join(root))
         )
         if not self.rounds:
             self.rounds = [()]
@@ -104,7 +104,7 @@ class _Assembly:
         """Return the recording."""
         rows, numbers, first = self._training_rows()
         parts = self.parts
-        worlds = [one.world for one in self.training if one.world]
+        worlds = [drives.world for drives in self.training if drives.world]
         rounds = [
             Round("/".join(root), first[number]) for number, root in enumerate(self.rounds) if number in first
         ]
@@ -131,13 +131,13 @@ class _Assembly:
     def _training_rows(self) -> tuple[list[Rows], Numbers, dict[int, int]]:
         """Return the rows, the numbers of the episodes, and the first iteration of each round."""
         place = {root: number for number, root in enumerate(self.rounds)}
-        drives = sorted(self.training, key=lambda one: (place[one.place.root], one.place.worker))
+        drives = sorted(self.training, key=lambda part: (place[part.place.root], part.place.worker))
         if not drives:
             return [], {}, {}
-        rounds = np.concatenate([np.full(len(one.iteration), place[one.place.root]) for one in drives])
-        worker = np.concatenate([np.full(len(one.iteration), one.place.worker) for one in drives])
-        iteration = np.concatenate([one.iteration for one in drives])
-        table = concatenated([one.table for one in drives])
+        rounds = np.concatenate([np.full(len(part.iteration), place[part.place.root]) for part in drives])
+        worker = np.concatenate([np.full(len(part.iteration), part.place.worker) for part in drives])
+        iteration = np.concatenate([part.iteration for part in drives])
+        table = concatenated([part.table for part in drives])
         if len(drives) > 1:
             # The rows of several workers are put in the order of iterations.
             order = np.lexsort((worker, iteration, rounds))
@@ -156,7 +156,7 @@ class _Assembly:
             so_far = int(iteration[of].max()) + 1
         self.iteration_of = dict(zip(episode.tolist(), iteration.tolist(), strict=True))
         worlds = [
-            next((one.world for one in drives if one.place.root == root and one.world), "")
+            next((part.world for part in drives if part.place.root == root and part.world), "")
             for root in self.rounds
         ]
         return [Rows(TRAINING, table, worker, iteration, episode, worlds, rounds)], numbers, first
@@ -165,9 +165,9 @@ class _Assembly:
         """Return the logs of a round that name its checkpoints."""
         return [
             log
-            for at, (files, log) in enumerate(self.logs)
+            for index, (files, log) in enumerate(self.logs)
             if (log.saved or (log.checkpoints and log.steps.rows and log_place(files, log).kind == TRAINING))
-            and self._round(files[0], self.roots[at]) == number
+            and self._round(files[0], self.roots[index]) == number
         ]
 
     def _base(self, number: int) -> int:
@@ -176,36 +176,36 @@ class _Assembly:
 
     def _checkpoints(self, first: Mapping[int, int]) -> dict[int, str]:
         """Return the names of checkpoints by the iteration that they drove."""
-        found: dict[int, str] = {}
+        names: dict[int, str] = {}
         for number, begin in first.items():
             base = self._base(number)
             for log in self._logs_of(number):
                 for name in (*log.saved, *(name for _, name in log.checkpoints)):
                     if checkpoint_number(name) >= base:  # a clone's log names its parent, too
-                        found[checkpoint_number(name) - base + begin] = name
-        return found
+                        names[checkpoint_number(name) - base + begin] = name
+        return names
 
     def _evaluation_rows(self) -> list[Rows]:
-        found = []
-        for name, one in self._evaluations().items():
-            raw, steps = (one.table[key].to_numpy().astype(np.int64) for key in ("episode", "steps"))
+        parts = []
+        for name, drives in self._evaluations().items():
+            raw, steps = (drives.table[key].to_numpy().astype(np.int64) for key in ("episode", "steps"))
             none = np.zeros_like(raw)
             episode, _ = number_episodes(none, none, raw, none, steps)
-            found.append(Rows(name, one.table, none, one.iteration, episode, [one.world], none))
-        return found
+            parts.append(Rows(name, drives.table, none, drives.iteration, episode, [drives.world], none))
+        return parts
 
     def _evaluations(self) -> dict[str, Drives]:
         """Return evaluations and races by their unique names, in chronological order."""
-        drives = [one for one in self.drives if one.place.kind != TRAINING]
-        drives.sort(key=lambda one: (_KINDS.index(one.place.kind), natural(one.place.name)))
+        drives = [race for race in self.drives if race.place.kind != TRAINING]
+        drives.sort(key=lambda race: (_KINDS.index(race.place.kind), natural(race.place.name)))
         named: dict[str, Drives] = {}
-        for one in drives:
-            name = one.place.name if one.place.name != TRAINING else "evaluation"
+        for race in drives:
+            name = race.place.name if race.place.name != TRAINING else "evaluation"
             if name in named:
-                name = "/".join((*one.place.root[-2:], name))
+                name = "/".join((*race.place.root[-2:], name))
             while name in named:
                 name += "+"
-            named[name] = one
+            named[name] = race
         return named
 
     def _updates(self, first: Mapping[int, int]) -> pd.DataFrame:
@@ -232,14 +232,14 @@ class _Assembly:
         if root in self.rounds or (len(self.rounds) == 1 and not self.copies):
             return self.rounds.index(root) if root in self.rounds else 0
         names: dict[tuple[str, ...], list[str]] = {}
-        for one in (*self.training, *self.copies.values()):
-            names.setdefault(one.place.root, []).extend(one.names)
+        for drives in (*self.training, *self.copies.values()):
+            names.setdefault(drives.place.root, []).extend(drives.names)
 
         def nearness(of: tuple[str, ...]) -> tuple[bool, int]:
             common = next(
-                (at for at, (a, b) in enumerate(zip(of, file.parts, strict=False)) if a != b), len(of)
+                (depth for depth, (a, b) in enumerate(zip(of, file.parts, strict=False)) if a != b), len(of)
             )
-            return any(same_job(file.name, known) for known in names.get(of, ())), common
+            return any(same_job(file.name, name) for name in names.get(of, ())), common
 
         nearest = max((*self.rounds, *self.copies), key=nearness)
         return self.rounds.index(nearest) if nearest in self.rounds else None
@@ -253,8 +253,8 @@ class _Assembly:
         rows: list[dict[str, Any]] = []
         evaluated: set[tuple[str, str]] = set()
         begins: dict[tuple[int, int], int] = {}
-        for of, own_worker, own in numbers if self.parts.left_out else ():
-            begins[of, own_worker] = min(own, begins.get((of, own_worker), own))
+        for of, own_worker, logged in numbers if self.parts.left_out else ():
+            begins[of, own_worker] = min(logged, begins.get((of, own_worker), logged))
         evaluations = self._evaluations()
         for file, episodes in self.parts.metrics:
             if not episodes:
@@ -268,25 +268,25 @@ class _Assembly:
                 if gone:
                     self._leave_out(file, "episodes", gone)
                 counted = _iterations_by_trial(episodes)
-                known = [
-                    self.iteration_of[numbers[key]] - at
-                    for row, at in zip(episodes, counted, strict=True)
+                shifts = [
+                    self.iteration_of[numbers[key]] - index
+                    for row, index in zip(episodes, counted, strict=True)
                     if row["phase"] == TRAINING and (key := (number, worker, row["episode"])) in numbers
                 ]
-                shift = int(np.median(known)) if known else first.get(number, 0)
-                for row, at in zip(episodes, counted, strict=True):
+                shift = int(np.median(shifts)) if shifts else first.get(number, 0)
+                for row, index in zip(episodes, counted, strict=True):
                     if row["episode"] < begin:
                         continue
                     key = (number, worker, row["episode"])
                     episode = numbers.get(key)
                     if episode is None:
                         episode = _behind(numbers, key)
-                    own_row = {"stream": TRAINING, "worker": worker, "iteration": at + shift}
+                    own_row = {"stream": TRAINING, "worker": worker, "iteration": index + shift}
                     rows.append({**row, **own_row, "episode": episode})
             else:
                 stream = label(file.name)
-                for name, one in evaluations.items():
-                    if any(same_job(file.name, known) for known in one.names):
+                for name, drives in evaluations.items():
+                    if any(same_job(file.name, job) for job in drives.names):
                         stream = name
                         break
                 # A copy of another evaluation's folder.
@@ -300,24 +300,24 @@ class _Assembly:
 
 def _iterations_by_trial(rows: Sequence[Mapping[str, Any]]) -> list[int]:
     """Return the iteration of each episode of a metrics file, from 0: its trials are counted from 1."""
-    found: list[int] = []
+    iterations: list[int] = []
     iteration, trial = 0, 0
     for row in rows:
         if row["phase"] == TRAINING:
             iteration += row["trial"] <= trial
             trial = row["trial"]
-        found.append(iteration)
-    return found
+        iterations.append(iteration)
+    return iterations
 
 
 def _behind(numbers: Numbers, key: tuple[int, int, int]) -> int:
     """Return a number for an episode without rows: as far after its worker's last one as in the metrics file."""
-    mine = [(own, number) for (of, worker, own), number in numbers.items() if (of, worker) == key[:2]]
+    mine = [(logged, number) for (of, worker, logged), number in numbers.items() if (of, worker) == key[:2]]
     if not mine:
         return key[2]
-    own, _ = max(mine)
-    same = all(own == number for own, number in mine)
-    return key[2] if same else max(numbers.values()) + max(1, key[2] - own)
+    last, _ = max(mine)
+    same = all(logged == number for logged, number in mine)
+    return key[2] if same else max(numbers.values()) + max(1, key[2] - last)
 
 
 def _of_training(file: LogFile, episodes: Sequence[Mapping[str, Any]]) -> bool:
@@ -329,15 +329,15 @@ def _of_training(file: LogFile, episodes: Sequence[Mapping[str, Any]]) -> bool:
 
 def _iterations(updates: Sequence[Update]) -> list[int]:
     """Return the iteration of each update: that of the episodes before it, or one more than the last."""
-    found: list[int] = []
+    iterations: list[int] = []
     for number, update in enumerate(updates):
         last = updates[number - 1] if number else None
         if last is None:
-            found.append(update.logged_iteration or 0)
+            iterations.append(update.logged_iteration or 0)
         elif update.epoch > last.epoch and update.logged_iteration in (last.logged_iteration, None):
-            found.append(found[-1])
+            iterations.append(iterations[-1])
         else:
-            found.append(
-                max(-1 if update.logged_iteration is None else update.logged_iteration, found[-1] + 1)
+            iterations.append(
+                max(-1 if update.logged_iteration is None else update.logged_iteration, iterations[-1] + 1)
             )
-    return found
+    return iterations

@@ -93,7 +93,7 @@ class LogProblem:
     """Counted from 1; None: the whole file."""
     reason: str
     lines: int = 1
-    """How many lines it stands for: beyond a limit, the unreadable lines of a file are only counted."""
+    """Number of lines that it stands for: beyond a limit, the unreadable lines of a file are only counted."""
 
     def __post_init__(self) -> None:
         """Make the file's name printable."""

@@ -155,7 +155,7 @@ def read_trace_csv(stream: IO[bytes]) -> tuple[StepTables, Refused]:
             break
         # The pattern takes a hundred times as long as the search, and few files have a second header.
         again = block.find(b"episode", block.find(b"\n") + 1) >= 0
-        headers = [found.end() for found in _BEFORE_HEADER.finditer(block)] if again else []
+        headers = [match.end() for match in _BEFORE_HEADER.finditer(block)] if again else []
         for start, end in pairwise([0, *headers, len(block)]):
             rows = block[start:end]
             if header is None or _HEADER.match(rows):

@@ -65,7 +65,7 @@ class TrainingLog:
     iteration_of: dict[int, int] = field(default_factory=dict)
     """Iteration of an episode, both counted from 0. A simulation logs 0 for all of them, a trainer the right one."""
     evaluated_after: list[int] = field(default_factory=list)
-    """How many episodes were driven before each evaluation; there is one after every iteration."""
+    """Number of episodes driven before each evaluation; there is one after every iteration."""
     hyperparameters: dict[str, Any] | None = None
     action_space: Any = None
     sensors: dict[str, Any] | None = None
@@ -76,7 +76,7 @@ class TrainingLog:
     worker: int | None = None
     """Number of the simulation worker that wrote it, from 0."""
     job: str | None = None
-    """Where the training's files are stored; all its workers have the same."""
+    """Folder in which the training's files are stored, the same for all its workers."""
     checkpoints: list[tuple[int | None, str]] = field(default_factory=list)
     """First episode driven with each checkpoint (None: not driven yet) and its name, `309_Step-8349`."""
     saved: list[str] = field(default_factory=list)
@@ -87,8 +87,8 @@ class TrainingLog:
     @property
     def recognised(self) -> bool:
         """Whether it is a log of the service at all."""
-        found = (self.updates, self.iteration_of, self.hyperparameters, self.sensors, self.world, self.saved)
-        return self.steps.found or any(map(bool, found))
+        read = (self.updates, self.iteration_of, self.hyperparameters, self.sensors, self.world, self.saved)
+        return self.steps.found or any(map(bool, read))
 
     @property
     def metadata(self) -> dict[str, Any] | None:
@@ -118,9 +118,9 @@ def read_training_logs(stream: IO[bytes]) -> list[TrainingLog]:
                 before[key] = _read_trace(log, part, lines, before.get(key))
             _read_updates(log, part, lines)
             _read_job(log, part)
-    found = [log for log in logs.values() if log.recognised or log.refused] or [logs[b""]]
-    found[0].refused += blocks.refused
-    return found
+    recognised = [log for log in logs.values() if log.recognised or log.refused] or [logs[b""]]
+    recognised[0].refused += blocks.refused
+    return recognised
 
 
 def _parts(
@@ -136,14 +136,14 @@ def _parts(
             yield tag, b"\n".join(row if row.startswith(begins) else b"" for row in rows), lines
         return
     start = 0
-    for found in _WORKER.finditer(block):
-        worker, at = found[1], block.rfind(b"\n", 0, found.start()) + 1
-        known = logs[key].worker if key in logs else None
+    for match in _WORKER.finditer(block):
+        worker, begin = match[1], block.rfind(b"\n", 0, match.start()) + 1
+        earlier = logs[key].worker if key in logs else None
         # A worker logs its number once, at its beginning.
-        if (known is not None or start) and str(known).encode() != worker and at > start:
-            yield key, block[start:at], lines + block.count(b"\n", 0, start)
-            key, start = b"worker " + worker, at
-        elif known is None and key in logs:
+        if (earlier is not None or start) and str(earlier).encode() != worker and begin > start:
+            yield key, block[start:begin], lines + block.count(b"\n", 0, start)
+            key, start = b"worker " + worker, begin
+        elif earlier is None and key in logs:
             logs[key].worker = int(worker)
     yield key, block[start:], lines + block.count(b"\n", 0, start)
 
@@ -151,19 +151,19 @@ def _parts(
 def _read_checkpoints(log: TrainingLog, block: bytes) -> None:
     """Record from which episode on each checkpoint drives."""
     marks = sorted(
-        [(found.start(), found[1].decode()) for found in _RESTORED.finditer(block)]
+        [(match.start(), match[1].decode()) for match in _RESTORED.finditer(block)]
         + ([(0, "")] if log.checkpoints and log.checkpoints[-1][0] is None else [])
     )
     for start, name in marks:
-        at = block.find(MARKER, start) + len(MARKER)
-        episode = block[at : at + 12].partition(b",")[0] if at >= len(MARKER) else b""
+        begin = block.find(MARKER, start) + len(MARKER)
+        episode = block[begin : begin + 12].partition(b",")[0] if begin >= len(MARKER) else b""
         first = int(episode) if episode.isdigit() else None
         if not name:
             name = log.checkpoints.pop()[1]
         if log.checkpoints and log.checkpoints[-1][0] in (first, None):
             log.checkpoints.pop()
         log.checkpoints.append((first, name))
-    log.saved += [found[1].decode() for found in _SAVED.finditer(block)]
+    log.saved += [match[1].decode() for match in _SAVED.finditer(block)]
 
 
 def _read_trace(log: TrainingLog, block: bytes, lines_before: int, before: int | None) -> int:
@@ -173,8 +173,8 @@ def _read_trace(log: TrainingLog, block: bytes, lines_before: int, before: int |
     table, refused = read_rows(rows, LOG_LAYOUTS, before)
     log.steps.add(table)
     if refused:
-        starts = [found.start() for found in _TRACE.finditer(block)]
-        log.refused += [(_line(block, starts[at], lines_before), reason) for at, reason in refused]
+        starts = [match.start() for match in _TRACE.finditer(block)]
+        log.refused += [(_line(block, starts[index], lines_before), reason) for index, reason in refused]
     return rows.count(b",", rows.rfind(b"\n", 0, -1) + 1) + 1
 
 
@@ -224,16 +224,16 @@ def _read_job(log: TrainingLog, block: bytes) -> None:
         for _, line in _find(block, b"Sensor list ["):
             log.sensors = log.sensors or _sensors(line)
     if log.world is None:
-        names = [found[1] for _, line in _find(block, b"WORLD_NAME") if (found := _WORLD.match(line))]
+        names = [match[1] for _, line in _find(block, b"WORLD_NAME") if (match := _WORLD.match(line))]
         # ROS shortens what it prints; the whole name may stand elsewhere.
         log.world = next((name.decode() for name in names if not name.endswith(b"...")), None)
 
 
 def _sensors(line: bytes) -> dict[str, Any] | None:
-    found = _SENSORS.match(line)
-    if found is None:
+    match = _SENSORS.match(line)
+    if match is None:
         return None
-    sensor, network, version, algorithm, kind, lidar = found.groups()
+    sensor, network, version, algorithm, kind, lidar = match.groups()
     values = {
         "sensor": _parsed(ast.literal_eval, sensor),
         "neural_network": network.decode(),
@@ -298,7 +298,7 @@ def join_rolled(logs: Sequence[tuple[LogFile, TrainingLog]]) -> list[tuple[list[
             kind=next((log.kind for _, log in pieces if log.kind), None),
             worker=next((log.worker for _, log in pieces if log.worker is not None), None),
             job=next((log.job for _, log in pieces if log.job), None),
-            checkpoints=[one for _, log in pieces for one in log.checkpoints],
+            checkpoints=[checkpoint for _, log in pieces for checkpoint in log.checkpoints],
             saved=[name for _, log in pieces for name in log.saved],
         )
         joined.append(([file for file, _ in pieces], whole))
@@ -316,17 +316,17 @@ def _with_numbered(
 ) -> list[list[tuple[LogFile, TrainingLog]]]:
     """Join groups whose names differ by a number alone (`sim-trace-log-2.log`) if their episodes continue."""
     alike: dict[tuple[str | int, ...], list[list[tuple[LogFile, TrainingLog]]]] = {}
-    for (*folders, name, at), pieces in groups.items():
-        alike.setdefault((*folders, _NUMBERED.sub("", str(name)), at), []).append(pieces)
-    found = []
+    for (*folders, name, place), pieces in groups.items():
+        alike.setdefault((*folders, _NUMBERED.sub("", str(name)), place), []).append(pieces)
+    joined = []
     for similar in alike.values():
         whole = sorted((piece for pieces in similar for piece in pieces), key=_time_of_piece)
         places = [_places(log) for _, log in whole]
         continues = all(map(len, places)) and all(
             later[0] > earlier.max() for earlier, later in pairwise(places)
         )
-        found += [whole] if len(similar) > 1 and continues else similar
-    return found
+        joined += [whole] if len(similar) > 1 and continues else similar
+    return joined
 
 
 def _time_of_piece(piece: tuple[LogFile, TrainingLog]) -> tuple[int, int, int]:

@@ -28,7 +28,7 @@ PLACES = {
     },
     "deepracer-for-cloud": {"trace": "training-simtrace", "metrics": "metrics/TrainingMetrics.json"},
 }
-"""Where each layout keeps traces and metrics."""
+"""Folders in which each layout keeps traces and metrics."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,18 +99,18 @@ def metrics_text(numbered: NumberedTraining, evaluated: pd.DataFrame) -> str:
     items: list[dict[str, Any]] = []
     for iteration, episodes in numbered.episodes.groupby("iteration", sort=False):
         end_s = 0.0
-        for one in episodes.itertuples():
-            end_s = one.end_s
+        for episode in episodes.itertuples():
+            end_s = episode.end_s
             items.append(
                 _item(
-                    one.reward,
-                    one.begin_s,
-                    one.end_s,
-                    episode=int(one.number) + 1,
-                    trial=int(one.trial),
+                    episode.reward,
+                    episode.begin_s,
+                    episode.end_s,
+                    episode=int(episode.number) + 1,
+                    trial=int(episode.trial),
                     phase="training",
-                    completion_percentage=int(one.progress),
-                    episode_status=LABELS.get(one.status, one.status),
+                    completion_percentage=int(episode.progress),
+                    episode_status=LABELS.get(episode.status, episode.status),
                 )
             )
         row = tried.get(int(iteration))

@@ -147,15 +147,15 @@ def _read(files: _Files, checkpoint: str) -> StoredModel:
         tensors = read_tensors(entries, files.read(data, DATA_BYTES), f"{files.path}/{data}")
     else:
         tensors = read_weights(where, files.read(chosen, GRAPH_BYTES))
-    found = {name: _nearest(files.sizes, name) for name in SMALL_FILES}
-    small = {name: files.read(at, SETTINGS_BYTES) for name, at in found.items() if at is not None}
+    nearest = {name: _nearest(files.sizes, name) for name in SMALL_FILES}
+    small = {name: files.read(place, SETTINGS_BYTES) for name, place in nearest.items() if place is not None}
     has_logs = any(map(_LOGS.search, files.sizes))
     return StoredModel(tensors, where, small, has_logs, (note,) if note else ())
 
 
 def _nearest(names: Mapping[str, int], wanted: str) -> str | None:
-    found = [name for name in names if PurePosixPath(name).name == wanted]
-    return min(found, key=lambda name: (name.count("/"), name), default=None)
+    matches = [name for name in names if PurePosixPath(name).name == wanted]
+    return min(matches, key=lambda name: (name.count("/"), name), default=None)
 
 
 def _choose(files: _Files, weights: list[str], checkpoint: str) -> tuple[str, str]:
@@ -191,26 +191,26 @@ def _choose(files: _Files, weights: list[str], checkpoint: str) -> tuple[str, st
         if beside(NEWEST) in files.sizes
         else ""
     )
-    asked = str(listed.get(f"{checkpoint}_checkpoint", ""))
-    for name in (asked, str(listed.get("last_checkpoint", "")), newest.strip(), list(by_stem)[-1]):
+    listed_name = str(listed.get(f"{checkpoint}_checkpoint", ""))
+    for name in (listed_name, str(listed.get("last_checkpoint", "")), newest.strip(), list(by_stem)[-1]):
         # The frozen graph of 11_Step-38428.ckpt is model_11.pb.
         for stem in (name, f"model_{name.partition('_')[0]}.pb"):
             if stem in by_stem:
-                same = stem == asked or name == asked
-                what = f"the {checkpoint} checkpoint" + (f", {asked}," if asked else "")
+                same = stem == listed_name or name == listed_name
+                what = f"the {checkpoint} checkpoint" + (f", {listed_name}," if listed_name else "")
                 return by_stem[stem], "" if same else f"{what} is not among the files: {stem} is used"
     raise AssertionError("the newest is among them")
 
 
 @contextmanager
 def _opened(path: str) -> Iterator[_Files]:
-    found = Path(path).stat()
-    if stat.S_ISDIR(found.st_mode):
+    status = Path(path).stat()
+    if stat.S_ISDIR(status.st_mode):
         yield _folder(path)
         return
-    if not stat.S_ISREG(found.st_mode):
+    if not stat.S_ISREG(status.st_mode):
         raise BadInput(path, "is neither a file nor a folder", _ACCEPTED)
-    if found.st_size > LOG_BYTES:
+    if status.st_size > LOG_BYTES:
         raise BadInput(path, f"is larger than {LOG_BYTES // 2**30} GiB", _ACCEPTED)
     with Path(path).open("rb") as file:
         head = file.read(512)
@@ -230,9 +230,9 @@ def _folder(path: str) -> _Files:
     for folder, _, names in os.walk(path):
         for name in names:
             file = Path(folder, name)
-            found = file.lstat()
-            if stat.S_ISREG(found.st_mode):
-                files.add(file.relative_to(path).as_posix(), found.st_size)
+            status = file.lstat()
+            if stat.S_ISREG(status.st_mode):
+                files.add(file.relative_to(path).as_posix(), status.st_size)
     return files
 
 

@@ -129,9 +129,9 @@ def _layers(tensors: Mapping[str, Tensor], scope: str) -> list[str]:
     """Return the names of a scope's layers in their order: `Conv2d_0`, `Conv2d_2`, ..."""
     numbers = {}
     for name in tensors:
-        found = re.fullmatch(re.escape(scope) + r"/[A-Za-z0-9]+_(\d+)/kernel", name)
-        if found:
-            numbers[name.removesuffix("/kernel")] = int(found[1])
+        match = re.fullmatch(re.escape(scope) + r"/[A-Za-z0-9]+_(\d+)/kernel", name)
+        if match:
+            numbers[name.removesuffix("/kernel")] = int(match[1])
     return sorted(numbers, key=numbers.__getitem__)
 
 

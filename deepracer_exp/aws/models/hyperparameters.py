@@ -95,7 +95,7 @@ def read_hyperparameters(
     """
     file = JsonObject(path, "a hyperparameters.json", "a JSON object with batch_size, lr, ...", raw)
     values: dict[str, int | float | str] = {}
-    given = []
+    set_keys = []
     for key, value in file.data.items():
         try:
             if key in _WHOLE:
@@ -109,8 +109,8 @@ def read_hyperparameters(
                 raise
             refused.append(error.without(path))
         else:
-            given.append(key)
-    return Hyperparameters(**values, given=tuple(given))  # type: ignore[arg-type]
+            set_keys.append(key)
+    return Hyperparameters(**values, given=tuple(set_keys))  # type: ignore[arg-type]
 
 
 def hyperparameters_text(values: Hyperparameters) -> str:

@@ -37,12 +37,12 @@ _TRUE, _FALSE = ("true", "t", "yes", "y", "on", "1"), ("false", "f", "no", "n", 
 
 @dataclass(frozen=True, kw_only=True)
 class JobSettings:
-    """What one simulation worker of the service was to do; None: the file does not say."""
+    """The task of one simulation worker of the service; None where the file does not say."""
 
     file: str
     """Path of the file."""
     keys: Mapping[str, str]
-    """How the file calls the keys of training_params.yaml."""
+    """The file's names for the keys of training_params.yaml."""
     given: tuple[str, ...]
     """The file's own keys, in its order."""
     world: str | None
@@ -88,12 +88,12 @@ def read_run_env(path: str, workers: Mapping[int, str]) -> tuple[JobSettings, ..
     first = _settings(path, values, ENV_KEYS, tuple(values))
     if not first.has_several:
         return (first,)
-    found = [first]
+    settings = [first]
     for number in sorted(workers):
-        own = _read_env(workers[number])
-        values = values | own
-        found.append(_settings(workers[number], values, ENV_KEYS, tuple(own)))
-    return tuple(found)
+        worker = _read_env(workers[number])
+        values = values | worker
+        settings.append(_settings(workers[number], values, ENV_KEYS, tuple(worker)))
+    return tuple(settings)
 
 
 def read_training_params(path: str) -> tuple[JobSettings, ...]:
@@ -126,12 +126,12 @@ def _read_env(path: str) -> dict[str, str]:
     for number, line in enumerate(read_text(path, accepted).splitlines(), 1):
         if not (text := line.strip()) or text.startswith("#"):
             continue
-        if (found := _LINE.fullmatch(text)) is None:
+        if (match := _LINE.fullmatch(text)) is None:
             raise BadInput(path, f"line {number}: {text[:80]}", accepted)
-        value = found[2].strip()
+        value = match[2].strip()
         quoted = re.match(r"""(["'])(.*?)\1""", value)
         # A shell ends an unquoted value at a blank.
-        values[found[1]] = quoted[2] if quoted else (value.split() or [""])[0]
+        values[match[1]] = quoted[2] if quoted else (value.split() or [""])[0]
     return values
 
 
@@ -158,9 +158,9 @@ def _settings(
 
     race_type = values.get(keys["RACE_TYPE"], RACE_TYPES[0]).upper()
     if race_type not in RACE_TYPES:
-        known = ", ".join(RACE_TYPES)
+        accepted = ", ".join(RACE_TYPES)
         raise BadInput(
-            path, f"{keys['RACE_TYPE']}={race_type[:80]}", f"{known}{nearest(race_type, RACE_TYPES)}"
+            path, f"{keys['RACE_TYPE']}={race_type[:80]}", f"{accepted}{nearest(race_type, RACE_TYPES)}"
         )
     return JobSettings(
         file=path,
@@ -179,8 +179,8 @@ def _settings(
         is_pretrained=bool(truth("PRETRAINED")),
         # A key in an S3 bucket, often with a variable in front: $DR_LOCAL_S3_CUSTOM_FILES_PREFIX/reward_function.py.
         files={
-            name: found[0]
+            name: match[0]
             for name, key in FILE_KEYS.items()
-            if (found := re.search(r"[A-Za-z0-9][\w.-]*\.(py|json)$", values.get(key, "")))
+            if (match := re.search(r"[A-Za-z0-9][\w.-]*\.(py|json)$", values.get(key, "")))
         },
     )

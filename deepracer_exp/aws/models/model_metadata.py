@@ -35,7 +35,7 @@ class Action(NamedTuple):
 
 
 class LidarSectors(NamedTuple):
-    """How a DISCRETIZED_SECTOR_LIDAR divides what it sees; `clipping_dist` in metres."""
+    """The sectors of a DISCRETIZED_SECTOR_LIDAR; `clipping_dist` in metres."""
 
     num_sectors: int = 8
     num_values_per_sector: int = 8
@@ -59,7 +59,7 @@ class ModelMetadata:
     sensor: tuple[str, ...] = ("FRONT_FACING_CAMERA",)
     neural_network: str = NEURAL_NETWORKS[0]
     version: int = 5
-    """Of the simulator; 5 is the newest that deepracer-for-cloud writes."""
+    """Version of the simulator; 5 is the newest that deepracer-for-cloud writes."""
     training_algorithm: str = "clipped_ppo"
     lidar_config: LidarSectors = SERVICES_SECTORS
     given: tuple[str, ...] = field(default=(), compare=False)
@@ -154,13 +154,13 @@ def _ranges(file: JsonObject, space: object) -> tuple[Action, Action]:
         raise file.bad("action_space", space, accepted)
 
     def bounds(key: str, number: Callable[[JsonObject, str, object], float]) -> tuple[float, float]:
-        name, given = f"action_space.{key}", space.get(key)
-        if not isinstance(given, dict):
-            raise file.bad(name, given, '{"low": number, "high": number}')
-        low = number(file, f"{name}.low", given.get("low"))
-        high = number(file, f"{name}.high", given.get("high"))
+        name, value = f"action_space.{key}", space.get(key)
+        if not isinstance(value, dict):
+            raise file.bad(name, value, '{"low": number, "high": number}')
+        low = number(file, f"{name}.low", value.get("low"))
+        high = number(file, f"{name}.high", value.get("high"))
         if low > high:
-            raise file.bad(name, given, f"low {low:g} not above high {high:g}")
+            raise file.bad(name, value, f"low {low:g} not above high {high:g}")
         return low, high
 
     steering, speed = bounds("steering_angle", _steering), bounds("speed", _speed)
@@ -174,23 +174,23 @@ def _version_and_sensor(file: JsonObject) -> tuple[int, tuple[str, ...]]:
     version = file.whole("version", version, 1, 6)
     if version == 1 or sensor is None:
         return version, ("observation",)
-    known = (*CAMERAS, *LIDARS)
+    sensors_accepted = (*CAMERAS, *LIDARS)
     accepted = f"a list with one of {', '.join(CAMERAS)} and at most one of {', '.join(LIDARS)}"
     if not isinstance(sensor, list) or not all(isinstance(name, str) for name in sensor):
         raise file.bad("sensor", sensor, accepted)
     for name in sensor:
-        if name not in known:
-            raise file.bad("sensor", name, accepted + nearest(name, known))
+        if name not in sensors_accepted:
+            raise file.bad("sensor", name, accepted + nearest(name, sensors_accepted))
     if sum(name in CAMERAS for name in sensor) != 1 or sum(name in LIDARS for name in sensor) > 1:
         raise file.bad("sensor", sensor, accepted)
     return version, tuple(sensor)
 
 
 def _lidar_config(file: JsonObject) -> LidarSectors:
-    given = file.data.get("lidar_config", {})
-    if not isinstance(given, dict):
-        raise file.bad("lidar_config", given, "an object with " + ", ".join(LidarSectors._fields))
-    values = SERVICES_SECTORS._asdict() | given
+    config = file.data.get("lidar_config", {})
+    if not isinstance(config, dict):
+        raise file.bad("lidar_config", config, "an object with " + ", ".join(LidarSectors._fields))
+    values = SERVICES_SECTORS._asdict() | config
     sectors, many, clip_m = (values[key] for key in LidarSectors._fields)
     sectors = file.whole("lidar_config.num_sectors", sectors, 1, 64)
     if 64 % sectors:

@@ -23,7 +23,7 @@ def field(number: int, value: int | str | bytes) -> bytes:
     return varint(number << 3 | BYTES) + varint(len(raw)) + raw
 
 
-def read_varint(raw: memoryview, at: int) -> tuple[int, int]:
+def read_varint(raw: memoryview, position: int) -> tuple[int, int]:
     """Return the number at a place, and the place after it.
 
     Raises:
@@ -31,13 +31,13 @@ def read_varint(raw: memoryview, at: int) -> tuple[int, int]:
     """
     value = 0
     for shift in range(0, 70, 7):
-        if at >= len(raw):
+        if position >= len(raw):
             raise ValueError("ends early")
-        byte = raw[at]
-        at += 1
+        byte = raw[position]
+        position += 1
         value |= (byte & 127) << shift
         if byte < 128:
-            return value, at
+            return value, position
     raise ValueError("holds a number of more than ten bytes")
 
 
@@ -47,18 +47,20 @@ def read_fields(message: memoryview) -> Iterator[tuple[int, int | memoryview]]:
     Raises:
         ValueError: it is not a message.
     """
-    at = 0
-    while at < len(message):
-        tag, at = read_varint(message, at)
+    position = 0
+    while position < len(message):
+        tag, position = read_varint(message, position)
         number, kind = tag >> 3, tag & 7
         if kind == VARINT:
-            value, at = read_varint(message, at)
+            value, position = read_varint(message, position)
             yield number, value
             continue
         if kind not in (FIXED64, BYTES, FIXED32):
             raise ValueError("is not a protobuf message")
-        size, at = read_varint(message, at) if kind == BYTES else (8 if kind == FIXED64 else 4, at)
-        if size > len(message) - at:
+        size, position = (
+            read_varint(message, position) if kind == BYTES else (8 if kind == FIXED64 else 4, position)
+        )
+        if size > len(message) - position:
             raise ValueError("ends early")
-        yield number, message[at : at + size]
-        at += size
+        yield number, message[position : position + size]
+        position += size

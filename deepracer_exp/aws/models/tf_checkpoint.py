@@ -26,7 +26,7 @@ INDEX, DATA, META = ".index", ".data-00000-of-00001", ".meta"
 INDEX_BYTES = 2**20
 """The service's has 1.2 KB."""
 DATA_BYTES = 2**30
-"""What deepracer-on-aws accepts; the largest network of the service needs 460 MB."""
+"""Most bytes that deepracer-on-aws accepts; the largest network of the service needs 460 MB."""
 _MOST_TENSORS = 1000
 _MAGIC = bytes.fromhex("57fb808b247547db")
 _RESTART_EVERY = 16
@@ -37,7 +37,7 @@ _HEADER = field(1, 1) + field(3, field(1, 1))
 
 
 class Entry(NamedTuple):
-    """Where a tensor is and what it is (BundleEntryProto)."""
+    """Position, type and shape of a tensor (BundleEntryProto)."""
 
     shape: tuple[int, ...]
     offset: int
@@ -46,7 +46,7 @@ class Entry(NamedTuple):
     crc: int
     """Masked CRC-32C of its bytes."""
     dtype: int = _FLOAT
-    """Of types.proto."""
+    """Number of the type in types.proto."""
 
 
 def read_index(raw: bytes, where: str) -> dict[str, Entry]:
@@ -126,8 +126,8 @@ def _entries(raw: memoryview) -> Iterator[tuple[str, Entry]]:
     if len(raw) < _FOOTER_BYTES or raw[-len(_MAGIC) :] != _MAGIC:
         raise ValueError("is incomplete or no index")
     footer = raw[-_FOOTER_BYTES:]
-    _, at = _handle(footer, 0)
-    place, _ = _handle(footer, at)
+    _, position = _handle(footer, 0)
+    place, _ = _handle(footer, position)
     number, header = 0, None
     for _, handle in _rows(_checked_block(raw, *place)):
         (offset, size), _ = _handle(handle, 0)
@@ -146,10 +146,10 @@ def _entries(raw: memoryview) -> Iterator[tuple[str, Entry]]:
         raise ValueError("lists no tensors")
 
 
-def _handle(raw: memoryview, at: int) -> tuple[tuple[int, int], int]:
-    offset, at = read_varint(raw, at)
-    size, at = read_varint(raw, at)
-    return (offset, size), at
+def _handle(raw: memoryview, position: int) -> tuple[tuple[int, int], int]:
+    offset, position = read_varint(raw, position)
+    size, position = read_varint(raw, position)
+    return (offset, size), position
 
 
 def _checked_block(raw: memoryview, offset: int, size: int) -> memoryview:
@@ -168,19 +168,19 @@ def _rows(block: memoryview) -> Iterator[tuple[bytes, memoryview]]:
     """Yield keys and values; each key is stored without the beginning that it shares with the one before."""
     (restarts,) = struct.unpack_from("<I", block, len(block) - 4)
     end = len(block) - 4 * (restarts + 1)
-    key, at = b"", 0
+    key, position = b"", 0
     if end < 0:
         raise ValueError("is corrupt: a block has no place for its restarts")
     block = block[:end]
-    while at < end:
-        shared, at = read_varint(block, at)
-        own, at = read_varint(block, at)
-        size, at = read_varint(block, at)
-        if shared > len(key) or own + size > end - at:
+    while position < end:
+        shared, position = read_varint(block, position)
+        unshared, position = read_varint(block, position)
+        size, position = read_varint(block, position)
+        if shared > len(key) or unshared + size > end - position:
             raise ValueError("is corrupt: a key or a value is longer than its block")
-        key = key[:shared] + bytes(block[at : at + own])
-        yield key, block[at + own : at + own + size]
-        at += own + size
+        key = key[:shared] + bytes(block[position : position + unshared])
+        yield key, block[position + unshared : position + unshared + size]
+        position += unshared + size
 
 
 def _block(rows: list[tuple[bytes, bytes]]) -> bytes:

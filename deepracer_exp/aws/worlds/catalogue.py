@@ -34,8 +34,8 @@ class World(NamedTuple):
 def worlds() -> Mapping[str, World]:
     """Return the worlds by name; those of a family are adjacent, its best known world first."""
     with zipfile.ZipFile(FILE) as file:
-        found = [World(**one) for one in json.loads(file.read(INDEX))["worlds"]]
-    return {world.name: world for world in found}
+        listed = [World(**fields) for fields in json.loads(file.read(INDEX))["worlds"]]
+    return {world.name: world for world in listed}
 
 
 @cache

@@ -113,8 +113,8 @@ def world_rows(name: str) -> np.ndarray:
         BadInput: there is no such world.
     """
     if name not in worlds():
-        known = f"`deepracer-exp tracks` lists all {len(worlds())}"
-        raise BadInput(name, f"no such world{nearest(name, worlds())}; {known}")
+        accepted = f"`deepracer-exp tracks` lists all {len(worlds())}"
+        raise BadInput(name, f"no such world{nearest(name, worlds())}; {accepted}")
     # Each world is stored as its second differences.
     rows = _bends()[name].astype(np.int64).cumsum(axis=0).cumsum(axis=0) / UNITS_PER_M
     rows.flags.writeable = False
@@ -149,16 +149,16 @@ def recognise(points: np.ndarray, closest_waypoint: np.ndarray) -> list[Recognis
         points: recorded points (n, 2) in metres; a few hundred from all around the lap are enough.
         closest_waypoint: the waypoint recorded with each (n,).
     """
-    found = []
+    matches = []
     last = int(closest_waypoint.max())
     for world in worlds().values():
         if last < world.rows:
             waypoints = world_rows(world.name)[:, :2]
             for reversed, line in ((False, waypoints), (True, waypoints[::-1])):
                 away_m = np.linalg.norm(points - line[closest_waypoint], axis=1)
-                found.append(Recognised(world.name, reversed, float(away_m.mean())))
-    near = [one for one in found if one.distance_m < NEAR_M]
-    return sorted(near, key=lambda one: round(one.distance_m, 6))
+                matches.append(Recognised(world.name, reversed, float(away_m.mean())))
+    near = [match for match in matches if match.distance_m < NEAR_M]
+    return sorted(near, key=lambda match: round(match.distance_m, 6))
 
 
 def read_knots(path: str | Path) -> Knots:
@@ -204,10 +204,10 @@ def rows_from_knots(knots: ArrayLike, width_m: ArrayLike, closed: bool) -> np.nd
     if closed:
         knots, width_m = np.concatenate([knots, knots[:1]]), np.r_[width_m, width_m[:1]]
     chord_m = np.linalg.norm(np.diff(knots, axis=0), axis=1)
-    at = np.r_[0.0, np.cumsum(np.sqrt(chord_m))]
-    spline = CubicSpline(at, np.column_stack([knots, width_m]), bc_type="periodic" if closed else "natural")
+    knot = np.r_[0.0, np.cumsum(np.sqrt(chord_m))]
+    spline = CubicSpline(knot, np.column_stack([knots, width_m]), bc_type="periodic" if closed else "natural")
 
-    fine = np.linspace(0.0, at[-1], 100 * len(knots) + 1)
+    fine = np.linspace(0.0, knot[-1], 100 * len(knots) + 1)
     step_m = np.linalg.norm(np.diff(spline(fine)[:, :2], axis=0), axis=1)
     distance_m = np.r_[0.0, np.cumsum(step_m)]
     rows = min(max(8, round(distance_m[-1] / SPACING_M)), MOST_ROWS)
