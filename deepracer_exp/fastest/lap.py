@@ -36,7 +36,7 @@ from .search import OnRound, Search, lap_time_s
 
 Floats = NDArray[np.float64]
 
-ALGORITHM = 2
+ALGORITHM = 3
 """Laps that an earlier version found are searched again."""
 COLUMNS = ("time_s", "x_m", "y_m", "yaw_rad", "speed_mps", "progress", "steering_deg", "commanded_mps")
 """Of a lap's steps: clock, front of the car, heading, speed, per cent of the lap, and the command given there."""
@@ -154,7 +154,8 @@ class Question:
         """Return the bound from below of the lap time in s, and its line, (n, 2).
 
         Args:
-            driven: chassis origins of a lap (n, 2), from whose line the search for the least time begins as well.
+            driven: chassis origins of a lap (n, 2), from whose line the search for the least time begins, in place
+                of simple lines.
         """
         car = self.experiment.car
         least_s, line = fastest_line(self.track, car.reach_m, self._ability, 0.0, car.front_point_m, driven)

@@ -1,12 +1,17 @@
-"""The search for the fastest lap: a slow lap along the centre line, made faster until nothing more is gained.
+"""The search for the fastest lap: planned a few seconds at a time, then improved as a whole.
 
 Commands are held for a control period and the road counts at the end of each, as in the environment. The search asks
 for the longest way in a given number of periods; where the car gets over the line with a period to spare, it goes on
 with one period less.
+
+Improving commands leads to the best ones near by only. Each few seconds are therefore planned from several first
+guesses, of which the plan that gets farthest is driven, and a lap is searched again with the line of the best one so
+far among the guesses.
 """
 
 import math
 from collections.abc import Callable, Sequence
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -28,10 +33,8 @@ OnRound = Callable[[float, float | None], None]
 
 MARGIN_M = 0.002
 """How far inside the road the car's best placed wheel is kept, for the rounding of the optimisation."""
-_WINDOW, _TRUSTED, _DRIVEN = 45, 30, 10
-"""Control periods that are planned at a time, that are kept of a plan, and that are driven before the next plan."""
-_TAIL_MPS = 1.8
-"""Speed along the line where there is no plan yet."""
+_WINDOW, _TRUSTED = 60, 45
+"""Control periods that are planned at a time, and that are kept of a plan."""
 _LOOK_AHEAD_M, _APART_M = 0.35, 0.05
 _SLOWEST_LAP_MPS = 0.2
 _CALM = np.array([1e-4, 1e-3])
@@ -41,8 +44,19 @@ _STEPS = 5
 _GAIN_M = 2e-3
 _STIFFENING = 1.1
 _MOST_DAMPING = 100.0
-_FIRST_SHARE = 0.5
-"""Of a search until a lap is found; the rest improves it."""
+
+
+class _Pass(NamedTuple):
+    """How a lap is searched."""
+
+    driven: int
+    """Control periods that are driven before the next plan."""
+    guessed_mps: tuple[float, ...]
+    """Speeds along each line where there is no plan yet."""
+
+
+_PASSES = (_Pass(10, (1.8, 2.6)), _Pass(7, (2.0, 3.0)), _Pass(8, (2.0, 3.0)))
+"""They differ so that they end in different laps."""
 
 
 class Problem(NamedTuple):
@@ -79,66 +93,75 @@ class Search:
         """Return the commands of the fastest lap that was found, [speed_mps, steering_rad] of each period, (n, 2).
 
         Args:
-            lines: along which the car is sent where it has no better plan yet, (n, 2) each, from the start on.
-            on_round: called after each round.
+            lines: first guesses of the way, (n, 2) each, from the start on.
+            on_round: called after each plan.
 
         Raises:
             RunFailed: no lap is possible within the limits.
         """
-        found: list[_Plan] = []
-        for number, line in enumerate(lines):
-            best_s = lap_time_s(min(len(plan.commands) for plan in found), self._car) if found else None
+        best: _Plan | None = None
+        for number, how in enumerate(_PASSES):
+            best_s = None if best is None else lap_time_s(len(best.commands), self._car)
+            ways = lines if best is None else (*lines, self._line(best.commands))
+            guesses = list(product([evenly(way, _APART_M)[0] for way in ways], how.guessed_mps))
 
             def progressed(share: float, number: int = number, best_s: float | None = best_s) -> None:
-                on_round((number + share) / len(lines), best_s)
+                on_round((number + share) / len(_PASSES), best_s)
 
-            plan = self._lap(evenly(line, _APART_M)[0], progressed)
-            if plan is not None and plan.complete:
-                found.append(plan)
-        if not found:
-            low, high = self._limits
-            raise RunFailed(
-                f"{self._track.name}: no lap was found that stays on the road with {low[0]:g} to {high[0]:g} m/s and "
-                f"steering of {np.degrees(low[1]):g} to {np.degrees(high[1]):g} degrees"
-            )
-        best = min(found, key=lambda plan: plan.score)
-        on_round(1.0, lap_time_s(len(best.commands), self._car))
-        return best.commands
+            commands = self._window_by_window(guesses, how.driven, progressed)
+            if commands is None:
+                continue
+            plan = self._improved(self._start, commands, 0.0, self._track.length_m, _LAP)
+            if plan.complete and (best is None or plan.score < best.score):
+                best = plan
+        if best is not None:
+            on_round(1.0, lap_time_s(len(best.commands), self._car))
+            return best.commands
+        low, high = self._limits
+        raise RunFailed(
+            f"{self._track.name}: no lap was found that stays on the road with {low[0]:g} to {high[0]:g} m/s and "
+            f"steering of {np.degrees(low[1]):g} to {np.degrees(high[1]):g} degrees"
+        )
 
-    def _lap(self, line: Floats, progressed: Callable[[float], None]) -> "_Plan | None":
-        """Return a lap that begins as one along a line, None if the car does not get around."""
-        commands = self._window_by_window(line, lambda share: progressed(_FIRST_SHARE * share))
-        if commands is None:
-            return None
-        return self._improved(
-            self._start, commands, 0.0, self._track.length_m, _LAP,
-            lambda share: progressed(_FIRST_SHARE + (1.0 - _FIRST_SHARE) * share),
-        )  # fmt: skip
+    def _line(self, commands: Floats) -> Floats:
+        """Return the chassis origins of a lap, (n, 2)."""
+        return np.array(
+            [origin(state, self._car.com_x_m)[:2] for state in self._states(self._start, commands)]
+        )
 
-    def _window_by_window(self, line: Floats, progressed: Callable[[float], None]) -> Floats | None:
+    def _window_by_window(
+        self, guesses: Sequence[tuple[Floats, float]], driven: int, progressed: Callable[[float], None]
+    ) -> Floats | None:
         """Return the commands of a fast lap, None if the car does not get around.
 
-        A window of the next seconds is planned as if only the way in it counted; its first part is driven, and the next
-        window begins there with what is left of the plan.
+        A window of the next seconds is planned as if only the way in it counted, once from each guess. The first
+        periods of the best plan are driven, and the next window begins there with what is left of the plan.
+
+        Args:
+            guesses: lines (n, 2), and the speed in m/s at which they are followed where there is no plan yet.
+            driven: control periods that are driven before the next plan.
+            progressed: called with the share of the lap that is driven.
         """
         state, driven_m_, plan = self._start, 0.0, np.empty((0, 2))
         commands: list[Floats] = []
         length_m = self._track.length_m
-        for _ in range(math.ceil(length_m / _SLOWEST_LAP_MPS * self._car.control_hz / _DRIVEN)):
-            plan = np.concatenate(
-                [plan, self._along(line, self._states(state, plan)[-1], _WINDOW - len(plan))]
-            )
-            begin_m = driven_m_
-            planned = self._improved(state, plan, begin_m, length_m - driven_m_, _AHEAD)
+        for _ in range(math.ceil(length_m / _SLOWEST_LAP_MPS * self._car.control_hz / driven)):
+            begin_m, kept = driven_m_, self._states(state, plan)[-1]
+            tails = [self._along(line, speed_mps, kept, _WINDOW - len(plan)) for line, speed_mps in guesses]
+            plans = [
+                self._improved(state, np.concatenate([plan, tail]), begin_m, length_m - begin_m, _AHEAD)
+                for tail in tails
+            ]
+            planned = min(plans, key=lambda one: one.score)
             plan = planned.commands
             if planned.complete:
                 return np.concatenate([*commands, plan])
-            states = self._states(state, plan[:_DRIVEN])
+            states = self._states(state, plan[:driven])
             moved_m = float(self._driven_m(states, begin_m)[-1])
-            if moved_m < _SLOWEST_LAP_MPS * _DRIVEN / self._car.control_hz:
+            if moved_m < _SLOWEST_LAP_MPS * driven / self._car.control_hz:
                 return None
-            commands.append(plan[:_DRIVEN])
-            state, plan, driven_m_ = states[-1], plan[_DRIVEN:_TRUSTED], driven_m_ + moved_m
+            commands.append(plan[:driven])
+            state, plan, driven_m_ = states[-1], plan[driven:_TRUSTED], driven_m_ + moved_m
             progressed(min(driven_m_ / length_m, 1.0))
         return None
 
@@ -158,7 +181,7 @@ class Search:
             problem.course, problem.front_point_m, problem.com_x_m, states, begin_m, problem.closed
         )
 
-    def _along(self, line: Floats, state: Floats, periods: int) -> Floats:
+    def _along(self, line: Floats, speed_mps: float, state: Floats, periods: int) -> Floats:
         """Return commands that send the car along a line, (periods, 2); it steers to a point ahead (pure pursuit)."""
         commands = np.empty((periods, 2))
         x, y, _, _ = origin(state, self._car.com_x_m)
@@ -172,7 +195,7 @@ class Search:
             away_m = math.hypot(aim[0] - x, aim[1] - y)
             bearing = math.remainder(math.atan2(aim[1] - y, aim[0] - x) - state[2], 2 * math.pi)
             steering = math.atan(2 * self._car.wheelbase_m * math.sin(bearing) / max(away_m, 1e-3))
-            commands[n] = np.clip([_TAIL_MPS, steering], *self._limits)
+            commands[n] = np.clip([speed_mps, steering], *self._limits)
             state = self._states(state, commands[n : n + 1])[-1]
         return commands
 
@@ -192,7 +215,6 @@ class Search:
         begin_m: float,
         goal_m: float,
         effort: "_Effort",
-        progressed: Callable[[float], None] = lambda share: None,
     ) -> "_Plan":
         """Return commands (n, 2) that get a car farther than those given, or past `goal_m` in fewer periods."""
         problem = self._problem(begin_m)
@@ -226,7 +248,6 @@ class Search:
                     commands[:end].copy(),
                     pull[: end + 1].copy(),
                 )
-            progressed((number + 1) / effort.rounds)
             if since >= effort.patience:
                 break
         return best

@@ -60,14 +60,13 @@ def fastest_line(
         start_ndist: where a lap from standstill begins, at the centre line; None: a flying lap.
         short_m: how far before the line a lap from standstill ends, because the front of the car is ahead of the
             driven point.
-        driven: points of a lap (n, 2) from whose line the search begins as well.
+        driven: points of a lap (n, 2) from whose line the search begins, in place of simple lines.
     """
     road = _Road(track, reach_m, ability, start_ndist, short_m)
-    begin = [*road.simple_lines(), *([] if driven is None else [road.offsets_of(driven)])]
-    times = [road.time_s(offsets) for offsets in begin]
-    # The two most promising lines are improved, and that of the driven lap always.
-    chosen = {*np.argsort(times)[:2].tolist(), *([] if driven is None else [len(begin) - 1])}
-    improved = min((road.improved(begin[k]) for k in chosen), key=lambda one: one[0])
+    lines = road.simple_lines() if driven is None else [road.offsets_of(driven)]
+    # Improving takes long; the two most promising lines are worth it.
+    promising = sorted(lines, key=road.time_s)[:2]
+    improved = min((road.improved(offsets) for offsets in promising), key=lambda one: one[0])
     return improved[0], road.line(improved[1])
 
 
