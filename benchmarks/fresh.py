@@ -12,8 +12,7 @@ from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation
-from deepracer_exp.lookup.resolve import resolve
-from deepracer_exp.runs.checkpoints import read_checkpoint
+from deepracer_exp.lookup.resolve import StoredRun
 
 TRIALS = 64
 _SEED = 20_181_128
@@ -44,7 +43,7 @@ class Driven:
 
 def protocol(*overrides: str) -> EvaluationConfig:
     """Return the evaluation that overrides of `deepracer-exp evaluate` describe."""
-    return compose_evaluation(["run=any", *overrides])[0].evaluation
+    return compose_evaluation(overrides)[0].evaluation
 
 
 def fresh_trials(trials: int) -> EvaluationConfig:
@@ -56,9 +55,8 @@ def fresh_trials(trials: int) -> EvaluationConfig:
 
 def stored_policy(run: Path, checkpoint: str | None = None) -> tuple[Experiment, nn.Module]:
     """Return a run's experiment and a policy of it; None: the best, or the last of a run too short to be ranked."""
-    stored = resolve(str(run), run.parent, None)
-    found = read_checkpoint(stored.experiment, stored.checkpoints, stored.choose_checkpoint(checkpoint))
-    return stored.experiment, found.networks.policy
+    stored = StoredRun(run).with_checkpoint(checkpoint)
+    return stored.experiment, stored.read_policy().networks.policy
 
 
 def drive(run: Path, checkpoints: Sequence[str | None], trials: int = TRIALS) -> list[Driven]:

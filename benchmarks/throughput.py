@@ -44,7 +44,7 @@ import torch
 
 from deepracer_exp.agents.actor_critic import build_actor_critic
 from deepracer_exp.collectors.collector import LocalCollector
-from deepracer_exp.commands.startup import start_workers_early
+from deepracer_exp.collectors.forking import start_workers_early
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.driving import RewardConfig
 from deepracer_exp.config.experiment import Experiment

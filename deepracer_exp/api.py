@@ -10,18 +10,18 @@ import pandas as pd
 from rich.console import Console
 from tensordict.nn import TensorDictModuleBase
 
-from deepracer_exp.config.compose import Composition, compose_evaluation, compose_experiment
+from deepracer_exp.config.compose import Composition, compose_experiment
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.config.overrides import override_line
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.race_env import RaceEnv
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.evaluation.evaluate import evaluate_run
+from deepracer_exp.evaluation.plan import plan_evaluation
 from deepracer_exp.evaluation.result import Evaluation
 from deepracer_exp.lookup.resolve import resolve
-from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import METRICS, SUMMARY, read_config, read_metrics, read_object
 from deepracer_exp.runs.recording import read_run_recording
+from deepracer_exp.training.plan import plan_resume, plan_training
 from deepracer_exp.training.run import resume_training, run_training
 from deepracer_exp.training.trainer import Callback, TrainResult
 
@@ -81,7 +81,7 @@ def train(
     Raises:
         BadInput: before anything was started; no folder is left.
     """
-    return run_training(experiment.config, experiment.composition, console, callbacks=callbacks)
+    return run_training(plan_training(experiment.config, experiment.composition), console, callbacks)
 
 
 def resume(
@@ -103,7 +103,8 @@ def resume(
     Raises:
         BadInput: it has ended, is being trained, or was started with other values.
     """
-    return resume_training(resolve(str(run), Path(runs_dir), None).path, overrides, console, callbacks)
+    plan = plan_resume(resolve(str(run), Path(runs_dir), None).path, overrides)
+    return resume_training(plan, console, callbacks)
 
 
 def evaluate(run: str | Path, *overrides: str) -> Evaluation:
@@ -117,10 +118,8 @@ def evaluate(run: str | Path, *overrides: str) -> Evaluation:
         BadInput: the run, the checkpoint, a track or a condition cannot be used.
         RunFailed: a car's state became NaN, or a file cannot be written.
     """
-    config, _ = compose_evaluation([*overrides, override_line("run", str(run))])
-    stored = resolve(config.run, Path(config.runs_dir), config.tracking.uri)
     quiet = Console(quiet=True)
-    return evaluate_run(stored, config, None, quiet, quiet)
+    return evaluate_run(plan_evaluation(str(run), overrides), None, quiet, quiet)
 
 
 def load_policy(
@@ -139,9 +138,7 @@ def load_policy(
     Raises:
         BadInput: there is no such run or checkpoint, or it is corrupt.
     """
-    stored = resolve(str(run), Path(runs_dir), None)
-    policy = read_checkpoint(stored.experiment, stored.checkpoints, stored.choose_checkpoint(checkpoint))
-    return policy.networks.policy
+    return resolve(str(run), Path(runs_dir), None).with_policy(checkpoint).read_policy().networks.policy
 
 
 @dataclass(frozen=True)

@@ -100,9 +100,7 @@ def configuration_page() -> str:
     text += "\n## Keys of the experiment itself\n" + _listing(conf_dir() / "train.yaml")
     text += "\n## sweep\n\nA sweep has keys of its own; `deepracer-exp sweep sweep=NAME` chooses a ready-made one.\n"
     text += _listing(conf_dir() / "sweep.yaml") + _listing(conf_dir() / "sweep" / "own.yaml")
-    for entry in ("evaluate", "export"):
-        text += f"\n## Keys of `deepracer-exp {entry}`\n" + _listing(conf_dir() / f"{entry}.yaml")
-    return text
+    return text + "\n## Keys of `deepracer-exp evaluate`\n" + _listing(conf_dir() / "evaluate.yaml")
 
 
 def train_groups() -> list[tuple[str, str | None, str]]:

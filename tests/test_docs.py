@@ -17,7 +17,7 @@ import yaml
 
 from deepracer_exp.cli import parse
 from deepracer_exp.commands.arguments import runs_and_overrides
-from deepracer_exp.config.compose import compose_evaluation, compose_experiment, compose_export, expand_grid
+from deepracer_exp.config.compose import compose_evaluation, compose_experiment, expand_grid
 from deepracer_exp.config.options import conf_dir, groups, options
 from deepracer_exp.config.sweep import compose_sweep
 from deepracer_exp.validation.laps import action_space_laps
@@ -138,9 +138,7 @@ def test_every_command_shown_is_accepted(words, folder, monkeypatch):
     elif words[0] == "validate":
         compose_experiment([word for word in args.overrides if not word.startswith("trial=")])
     elif words[0] in ("evaluate", "watch"):
-        compose_evaluation([*runs_and_overrides(args)[1], "run=RUN"])
-    elif words[0] == "export":
-        compose_export([*runs_and_overrides(args)[1], "run=RUN"])
+        compose_evaluation(runs_and_overrides(args)[1])
     elif words[0] == "sweep" and args.overrides[0] not in ("report", "best"):
         compose_sweep(args.overrides)
 

@@ -12,7 +12,6 @@ from deepracer_exp.errors import BadInput, writing
 from .arguments import Stores, add_command, add_overrides, complete_runs, is_override, read_stores
 from .output import table_console, warnings_on_stderr
 from .pages import existing_logs
-from .startup import check_policy
 from .tracks import ROUTES, experiment_on, search_fastest
 
 if TYPE_CHECKING:
@@ -197,14 +196,14 @@ def _of_track(what: str, is_route: bool, overrides: list[str], track: str | None
 def _of_run(what: str, stores: Stores, track: str | None) -> _Source:
     if track is not None:
         raise BadInput(f"--track {track}: {what} is no log; accepted for a log of several tracks")
-    chosen = stores.values.get("checkpoint")
-    run = check_policy(what, str(stores.runs_dir), stores.uri, chosen)
+
+    run = stores.find(what).with_policy(stores.values.get("checkpoint"))
 
     from deepracer_exp.export.aws_files import services_metadata
     from deepracer_exp.reports.driven_laps import commands_of_run
 
     with warnings_on_stderr():
-        commands = commands_of_run(run, chosen)
+        commands = commands_of_run(run)
     experiment = run.experiment
     return _Source(experiment.name, commands, experiment.car, services_metadata(experiment))
 

@@ -8,8 +8,8 @@ from deepracer_exp.errors import BadInput, count, writing
 from deepracer_exp.runs.files import REPORT
 
 from .arguments import add_command, add_overrides, complete_runs, is_override, read_stores
-from .pages import add_page, check_output, end_with_page, page_name, run_or_logs
-from .replay import add_replay, check_replay, write_laps
+from .output import check_file
+from .pages import add_page, add_replay, end_with_page, page_name, run_or_logs, write_laps
 
 if TYPE_CHECKING:
     from deepracer_exp.analysis.log_view import LogView
@@ -78,8 +78,8 @@ def _analyze(args: argparse.Namespace) -> int:
         more = "; deepracer-exp compare takes several" * (len(logs) > 1)
         raise BadInput(f"{' '.join(logs) or 'RUN'}: {len(logs)} runs or logs given; accepted: one{more}")
     place = run_or_logs(logs[0], stores)
-    check_output(args.output)
-    check_replay(args.replay)
+    check_file("--output", args.output)
+    check_file("--replay", args.replay, ".html")
     check_line_file(args.line)
     episode = None if args.lap is None else _episode(args.lap, args.line)
     reward = None

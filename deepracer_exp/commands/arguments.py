@@ -6,10 +6,13 @@ import shlex
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from deepracer_exp.errors import BadInput, nearest, reading
 from deepracer_exp.runs.files import BEST, RUN, run_folders
+
+if TYPE_CHECKING:
+    from deepracer_exp.lookup.resolve import StoredRun
 
 STORES = ("runs_dir", "tracking.uri")
 """Where runs are, and the MLflow store in which ids and aliases are looked up."""
@@ -115,6 +118,12 @@ class Stores:
     values: dict[str, str]
     """Of the other keys that the command takes."""
 
+    def find(self, run: str) -> "StoredRun":
+        """Find a run; arguments and errors as for `lookup.resolve.resolve`."""
+        from deepracer_exp.lookup.resolve import resolve
+
+        return resolve(run, self.runs_dir, self.uri)
+
 
 def read_stores(overrides: Iterable[str], keys: Sequence[str] = ()) -> Stores:
     """Read the overrides of a command that composes no configuration.
@@ -160,7 +169,8 @@ def complete_overrides(prefix: str, parsed_args: argparse.Namespace, **_: Any) -
     """Return the groups of a command, or the options of the group that was typed."""
     from deepracer_exp.config.options import groups, options
 
-    known = groups(getattr(parsed_args, "entry", "train"))
+    entry = getattr(parsed_args, "entry", "train")
+    known = [] if entry is None else groups(entry)
     group, equals, _value = prefix.partition("=")
     if equals:
         return [f"{group}={name}" for name in options(group)] if group in known else []

@@ -10,8 +10,8 @@ from .arguments import STORES, Stores, add_command, add_run, read_stores, runs_a
 from .compare_logs import CHECKPOINT, against_log, compare_recordings
 from .compare_runs import compare_runs
 from .compared import Item
-from .pages import add_page, check_output, existing_logs, run_or_logs
-from .replay import add_replay, check_replay
+from .output import check_file
+from .pages import add_page, add_replay, existing_logs, run_or_logs
 
 _EPILOG = """\
   deepracer-exp compare RUN RUN                             how two runs differ, and what each achieved
@@ -71,8 +71,8 @@ def _compare(args: argparse.Namespace) -> int:
     keys = (*STORES, CHECKPOINT)
     own = [word for word in overrides if word.partition("=")[0] in keys or "." in word.partition("=")[0]]
     stores = read_stores(allow_given(own), [CHECKPOINT])
-    check_output(args.output)
-    check_replay(args.replay)
+    check_file("--output", args.output)
+    check_file("--replay", args.replay, ".html")
     items = [_item(word, None, stores) for word in given]
     for word in overrides:
         if word not in own:
@@ -96,7 +96,7 @@ def _compare(args: argparse.Namespace) -> int:
     if one_of_each:
         (name,) = [item.word for item in items if not item.is_logs]
         return against_log(args, name, logs[0].paths[0], stores)
-    return compare_recordings(args, items) if logs else compare_runs(args, items, stores)
+    return compare_recordings(args, items) if logs else compare_runs(args, items)
 
 
 def _item(word: str, group: str | None, stores: Stores) -> Item:

@@ -11,9 +11,7 @@ from deepracer_exp.runs.files import TRACE
 from .arguments import Stores
 from .compared import Item, light, write_comparison_page
 from .output import print_table, table_console, warnings_on_stderr
-from .pages import end_with_page, page_name
-from .replay import write_laps
-from .startup import check_policy
+from .pages import end_with_page, page_name, write_laps
 
 if TYPE_CHECKING:
     from deepracer_exp.analysis.log_view import LogView
@@ -63,8 +61,7 @@ def compare_recordings(args: argparse.Namespace, items: Sequence[Item]) -> int:
 
 def against_log(args: argparse.Namespace, name: str, place: Path, stores: Stores) -> int:
     """Race a policy as the laps of a log were driven; draw how both learned where the log has a training."""
-    chosen = stores.values.get(CHECKPOINT)
-    run = check_policy(name, str(stores.runs_dir), stores.uri, chosen)
+    run = stores.find(name).with_policy(stores.values.get(CHECKPOINT))
 
     from deepracer_exp.analysis.charts.runs import recordings_compared
     from deepracer_exp.analysis.log_view import prepare, prepare_races
@@ -81,7 +78,7 @@ def against_log(args: argparse.Namespace, name: str, place: Path, stores: Stores
     from deepracer_exp.reports.driven_against_log import race_against_log
 
     with warnings_on_stderr():
-        both = race_against_log(run, chosen, view, args.track, Console(stderr=True, highlight=False))
+        both = race_against_log(run, view, args.track, Console(stderr=True, highlight=False))
     learned = None
     if (run.path / TRACE).is_dir() and (args.replay is not None or prepare(recording, args.track).trained):
         views = [prepare(read_log(run.path)), prepare(recording, args.track)]

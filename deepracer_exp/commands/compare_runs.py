@@ -11,12 +11,9 @@ from typing import TYPE_CHECKING
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.files import METRICS
 
-from .arguments import Stores
 from .compared import Item, light, write_comparison_page
 from .output import print_table, table_console
-from .pages import end_with_page
-from .replay import write_laps
-from .startup import check_policy
+from .pages import end_with_page, write_laps
 
 if TYPE_CHECKING:
     from deepracer_exp.analysis.charts.figure import Chart
@@ -38,7 +35,7 @@ _DIFFERENCES = (
 )
 
 
-def compare_runs(args: argparse.Namespace, items: Sequence[Item], stores: Stores) -> int:
+def compare_runs(args: argparse.Namespace, items: Sequence[Item]) -> int:
     """Compare runs, and groups of them."""
     from deepracer_exp.analysis.group_curves import curves_table
     from deepracer_exp.analysis.group_tables import groups_as_json
@@ -53,14 +50,15 @@ def compare_runs(args: argparse.Namespace, items: Sequence[Item], stores: Stores
     if args.format == "table" or args.output is not None:
         _show(args, items, _best(groups), len(groups), records)
     if args.replay is not None:
-        stored = [
-            check_policy(str(record.path), str(stores.runs_dir), stores.uri, None) for record in records
-        ]
+        from deepracer_exp.lookup.resolve import StoredRun
+
+        stored = [StoredRun(record.path).with_policy() for record in records]
+
         from deepracer_exp.reports.driven_laps import laps_to_replay
 
         protocol = stored[0].experiment.evaluation
-        (first,) = laps_to_replay(stored[0], None, protocol)
-        write_laps(args.replay, [first, *laps_to_replay(stored[1], None, protocol, beside=first)])
+        (first,) = laps_to_replay(stored[0], protocol)
+        write_laps(args.replay, [first, *laps_to_replay(stored[1], protocol, beside=first)])
         if args.format == "table":
             print(f"  laps  {args.replay}: the fastest laps of their best checkpoints")
     return 0

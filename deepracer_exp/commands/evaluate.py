@@ -10,13 +10,11 @@ from typing import TYPE_CHECKING
 from deepracer_exp.errors import BadInput
 
 from .arguments import add_command, add_run, port, run_and_overrides, runs_and_overrides, split_stores
-from .output import table_console, warnings_on_stderr
-from .replay import add_replay, check_replay, write_laps
-from .startup import check_policy
+from .output import check_file, table_console, warnings_on_stderr
+from .pages import add_replay, write_laps
 
 if TYPE_CHECKING:
-    from deepracer_exp.config.evaluation import EvaluateConfig
-    from deepracer_exp.lookup.resolve import StoredRun
+    from deepracer_exp.evaluation.plan import EvaluatePlan
 
 _EVALUATE_EPILOG = """\
   deepracer-exp evaluate RUN                                its best checkpoint
@@ -113,45 +111,34 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
 def _evaluate(args: argparse.Namespace) -> int:
     if args.cfg:
         from deepracer_exp.config.compose import compose_entry
-        from deepracer_exp.config.overrides import override_line
 
-        runs, overrides = runs_and_overrides(args)
-        named = [override_line("run", run) for run in runs]
-        print(compose_entry("evaluate", [*overrides, *named]).yaml(), end="")
+        print(compose_entry("evaluate", runs_and_overrides(args)[1]).yaml(), end="")
         return 0
-    config, _ = _composed(args)
-    if args.video is not None:
-        check_film("--video", Path(args.video))
+    run, overrides = run_and_overrides(args)
+    check_file("--video", args.video, ".mp4")
+    plan = _planned(args, run, overrides)
+    video = None if args.video is None else Path(args.video)
+    if video is not None:
         choose_graphics()
-    run = _policy(config)
 
     from rich.console import Console
 
     from deepracer_exp.evaluation.evaluate import evaluate_run
 
-    video = None if args.video is None else Path(args.video)
     out = Console(width=None if sys.stdout.isatty() else 160)
     with warnings_on_stderr():
-        evaluate_run(run, config, video, out, Console(stderr=True))
+        evaluate_run(plan, video, out, Console(stderr=True))
     return 0
 
 
-def _composed(args: argparse.Namespace) -> "tuple[EvaluateConfig, bool]":
-    """Return the configuration of the command line, and whether the trials are those of the training."""
-    from deepracer_exp.config.compose import compose_evaluation
-    from deepracer_exp.config.overrides import group_of, override_line
+def _planned(
+    args: argparse.Namespace, run: str, overrides: list[str], has_checkpoint: bool = True
+) -> "EvaluatePlan":
+    from deepracer_exp.evaluation.plan import plan_evaluation
 
-    run, overrides = run_and_overrides(args)
-    config, _ = compose_evaluation([*overrides, override_line("run", run)])
-    args.debug = config.debug
-    return config, not any(group_of(given) == "evaluation" for given in overrides)
-
-
-def _policy(config: "EvaluateConfig") -> "StoredRun":
-    """Return the run to race, after what can be checked before the imports that take seconds."""
-    return check_policy(
-        config.run, config.runs_dir, config.tracking.uri, config.checkpoint, config.evaluation
-    )
+    plan = plan_evaluation(run, overrides, has_checkpoint=has_checkpoint)
+    args.debug = plan.config.debug
+    return plan
 
 
 def _checkpoints_given(args: argparse.Namespace) -> list[str]:
@@ -180,11 +167,10 @@ def _watch(args: argparse.Namespace) -> int:
         raise BadInput(f"--port {args.port}: accepted: only with --live")
     if args.replay is not None:
         return _replay_laps(args)
-    if args.output is not None:
-        check_film("--output", Path(args.output))
-    config, own_trials = _composed(args)
+    check_file("--output", args.output, ".mp4")
+    run, overrides = run_and_overrides(args)
     if not args.live:
-        run = _policy(config)
+        plan = _planned(args, run, overrides)
 
         from rich.console import Console
 
@@ -192,29 +178,25 @@ def _watch(args: argparse.Namespace) -> int:
 
         file = None if args.output is None else Path(args.output)
         with warnings_on_stderr():
-            film_run(run, config, file, Console(), Console(stderr=True))
+            film_run(plan.run, plan.config.evaluation, file, Console(), Console(stderr=True))
         return 0
-    from deepracer_exp.config.own_class import OF_POLICY
-    from deepracer_exp.config.parse import import_own_classes
-    from deepracer_exp.lookup.resolve import resolve
     from deepracer_exp.reports.live_server import LiveServer
 
     # Its first checkpoint may be still to come.
-    stored = resolve(config.run, Path(config.runs_dir), config.tracking.uri)
-    import_own_classes(stored.experiment, OF_POLICY)
-    protocol = stored.experiment.evaluation if own_trials else config.evaluation
+    plan = _planned(args, run, overrides, has_checkpoint=False)
     with LiveServer(args.port or 0) as server, warnings_on_stderr():
         print(server.url, flush=True)
 
         from deepracer_exp.reports.live import serve_live
         from deepracer_exp.training.budget import Budget
 
-        serve_live(stored, protocol, server, Budget(stored.experiment.budget, stored.path).used)
+        used = Budget(plan.run.experiment.budget, plan.run.path).used
+        serve_live(plan.run, plan.training_protocol, server, used)
     return 0
 
 
 def _replay_laps(args: argparse.Namespace) -> int:
-    check_replay(args.replay)
+    check_file("--replay", args.replay, ".html")
     if args.live or args.output is not None:
         other = "--live" if args.live else f"--output {args.output}"
         raise BadInput(f"--replay {args.replay}: accepted: without {other}")
@@ -223,9 +205,7 @@ def _replay_laps(args: argparse.Namespace) -> int:
         raise BadInput(
             f"{' '.join(runs) or 'RUN'}: {len(runs)} given; accepted: a run, and another one or logs"
         )
-    args.runs, args.overrides = runs[:1], overrides
-    config, own_trials = _composed(args)
-    run, rival, view = _policy(config), None, None
+    plan, rival, view = _planned(args, runs[0], overrides), None, None
     if runs[1:]:
         from deepracer_exp.runs.files import is_run
 
@@ -236,18 +216,20 @@ def _replay_laps(args: argparse.Namespace) -> int:
 
             view = prepare_races(read_recording(place))
         else:
-            rival = check_policy(runs[1], config.runs_dir, config.tracking.uri, None)
+            from deepracer_exp.lookup.resolve import resolve
+
+            rival = resolve(runs[1], Path(plan.config.runs_dir), plan.config.tracking.uri).with_policy()
 
     from deepracer_exp.reports.driven_laps import laps_to_replay
     from deepracer_exp.reports.lap_replay import fastest_lap_of_log
 
-    protocol = run.experiment.evaluation if own_trials else config.evaluation
+    protocol = plan.training_protocol
     with warnings_on_stderr():
-        laps = laps_to_replay(run, config.checkpoint, protocol, ordinary=not runs[1:])
+        laps = laps_to_replay(plan.run, protocol, ordinary=not runs[1:])
         if view is not None:
             laps.append(fastest_lap_of_log(view, laps[0]))
         elif rival is not None:
-            laps += laps_to_replay(rival, None, protocol, beside=laps[0])
+            laps += laps_to_replay(rival, protocol, beside=laps[0])
     write_laps(args.replay, laps)
     print(f"  laps  {args.replay}")
     return 0
@@ -261,16 +243,6 @@ _CHECKPOINTS_EPILOG = """\
 
 Every checkpoint drives the same trials, on the usual and on held-out conditions.
 """
-
-
-def check_film(flag: str, file: Path) -> None:
-    """Check where a film is to be written.
-
-    Raises:
-        BadInput: the file is not an .mp4, or its folder does not exist.
-    """
-    if file.suffix != ".mp4" or not file.absolute().parent.is_dir():
-        raise BadInput(f"{flag} {file}: accepted: an .mp4 in an existing folder")
 
 
 def choose_graphics() -> None:
@@ -302,12 +274,8 @@ def choose_graphics() -> None:
 def _checkpoints(args: argparse.Namespace) -> int:
     if chosen := _checkpoints_given(args):
         raise BadInput(f"{chosen[0]}: all kept checkpoints are raced; `deepracer-exp evaluate` races one")
-    if args.output is not None:
-        page = Path(args.output)
-        if page.suffix != ".html" or not page.absolute().parent.is_dir():
-            raise BadInput(f"--output {page}: accepted: the name of a page (.html) in a folder")
-    config, own_trials = _composed(args)
-    run = _policy(config)
+    check_file("--output", args.output, ".html")
+    plan = _planned(args, *run_and_overrides(args))
 
     from rich.console import Console
 
@@ -315,7 +283,7 @@ def _checkpoints(args: argparse.Namespace) -> int:
 
     progress = Console(stderr=True, highlight=False, markup=False)
     with warnings_on_stderr():
-        show_checkpoints(run, config, own_trials, args.output, table_console(160), progress)
+        show_checkpoints(plan.run, plan.training_protocol, args.output, table_console(160), progress)
     return 0
 
 
@@ -329,7 +297,6 @@ _STOPPING_EPILOG = """\
 
 def _replay(args: argparse.Namespace) -> int:
     from deepracer_exp.config.compose import compose_experiment, expand_grid
-    from deepracer_exp.lookup.resolve import resolve
     from deepracer_exp.runs.files import read_record
 
     runs, given = runs_and_overrides(args)
@@ -341,7 +308,7 @@ def _replay(args: argparse.Namespace) -> int:
         raise BadInput("RUN: missing; accepted: a run's folder, or its name in runs/EXPERIMENT/")
     if not any(override.startswith("stopping=") for override in overrides):
         overrides.insert(0, "stopping=entropy")
-    records = [read_record(resolve(run, stores.runs_dir, stores.uri).path) for run in runs]
+    records = [read_record(stores.find(run).path) for run in runs]
 
     from deepracer_exp.stopping.replay import replay, table
 

@@ -4,13 +4,14 @@ import argparse
 import os
 import re
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
+from deepracer_exp.collectors.forking import start_workers_early
 from deepracer_exp.errors import BadInput
 
-from .arguments import add_command, add_overrides, add_run, run_and_overrides
+from .arguments import add_command, add_overrides, add_run, read_stores, run_and_overrides
 from .output import print_notes, warnings_on_stderr
-from .startup import check_files, check_policy, start_workers_early
 
 
 def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -65,7 +66,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         description="Write a run's policy as ONNX or for a physical car, the files that AWS's console and "
         "deepracer-for-cloud train from, or its logs in the format of these two.",
         epilog=_EXPORT_EPILOG,
-        entry="export",
+        entry=None,
     )
     add_run(parser, "format=onnx|aws|aws-model|aws-logs|car | KEY=VALUE")
     parser.add_argument(
@@ -96,16 +97,13 @@ def _import(args: argparse.Namespace) -> int:
     from deepracer_exp.config.imported_options import import_files
     from deepracer_exp.config.job_overrides import job_overrides, several_of
     from deepracer_exp.config.overrides import override_line
-    from deepracer_exp.env.action_space import action_remarks, build_action_space
-    from deepracer_exp.rewards.source import load_reward_source
+    from deepracer_exp.training.plan import plan_training
 
     files = read_custom_files(args.path)
-    experiment, composition = compose_experiment([override_line(KEY, args.path)])
-    load_reward_source(experiment.reward)
-    remarks = action_remarks(build_action_space(experiment.action_space), experiment.car)
-    written = import_files(files, args.name, composition.mapping)
+    plan = plan_training(*compose_experiment([override_line(KEY, args.path)]))
+    written = import_files(files, args.name, plan.composition.mapping)
     beside = shlex.join(line.replace("'", "") for line in several_of(job_overrides(files.workers, {})[0]))
-    print_notes((*composition.notes, *remarks))
+    print_notes((*plan.composition.notes, *plan.files.remarks))
     for path in written:
         print(path)
     print(f"\n  train it  deepracer-exp train experiment={args.name} {beside}".rstrip())
@@ -135,6 +133,11 @@ def _import_model(args: argparse.Namespace) -> int:
     return 0
 
 
+_EXPORTED = {
+    "format": ("onnx", "car", "aws", "aws-model", "aws-logs"),
+    "layout": ("console", "deepracer-for-cloud"),
+}
+"""Accepted values of the keys of `export`."""
 _EXPORT_EPILOG = """\
   deepracer-exp export RUN format=onnx                      the network as one file, checked against itself
   deepracer-exp export RUN format=onnx checkpoint=last -o policy.onnx
@@ -152,28 +155,34 @@ _EXPORT_EPILOG = """\
 
 
 def _export(args: argparse.Namespace) -> int:
-    from deepracer_exp.config.compose import compose_export
-    from deepracer_exp.config.overrides import override_line
-    from deepracer_exp.lookup.resolve import resolve
+    from deepracer_exp.config.own_class import allow_given
 
-    run, overrides = run_and_overrides(args)
-    config, _ = compose_export([*overrides, override_line("run", run)])
-    args.debug = config.debug
-    if config.format in ("onnx", "car", "aws-model"):
-        stored = check_policy(config.run, config.runs_dir, config.tracking.uri, config.checkpoint)
-        if config.format == "car":
-            from deepracer_exp.env.real_car import check_car
+    name, overrides = run_and_overrides(args)
+    stores = read_stores(allow_given(overrides), [*_EXPORTED, "checkpoint", "debug"])
+    if "format" not in stores.values:
+        raise BadInput(
+            "format",
+            "missing; write format=onnx, format=aws, format=aws-model, format=aws-logs, or, for a policy that sees "
+            "with the camera, format=car",
+        )
+    given = {key: stores.values.get(key, accepted[0]) for key, accepted in _EXPORTED.items()}
+    for key, value in given.items():
+        if value not in _EXPORTED[key]:
+            raise BadInput(f"{key}={value}", f"no such {key}", ", ".join(_EXPORTED[key]))
+    run = stores.find(name)
+    if given["format"] in ("onnx", "car", "aws-model"):
+        run = run.with_policy(stores.values.get("checkpoint"))
+    if given["format"] == "car":
+        from deepracer_exp.env.real_car import check_car
 
-            check_car(stored.experiment)
-    else:
-        stored = resolve(config.run, Path(config.runs_dir), config.tracking.uri)
+        check_car(run.experiment)
 
     from rich.console import Console
 
     from deepracer_exp.export.export import export
 
     with warnings_on_stderr():
-        export(stored, config, args.output, Console(highlight=False, markup=False))
+        export(run, **given, output=args.output, out=Console(highlight=False, markup=False))
     return 0
 
 
@@ -192,6 +201,7 @@ def _validate(args: argparse.Namespace) -> int:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
     from deepracer_exp.config.compose import compose_experiment
+    from deepracer_exp.training.plan import plan_training
 
     trials = [override for override in args.overrides if override.startswith("trial=")]
     overrides = [override for override in args.overrides if override not in trials]
@@ -199,16 +209,18 @@ def _validate(args: argparse.Namespace) -> int:
     experiment, composition = compose_experiment(overrides)
     args.debug = experiment.debug
     print_notes(composition.notes)
-    trial = compose_experiment([*overrides, *shorter]) if shorter else None
-    print_notes(check_files(experiment))
-    if trial is not None:
+    plan, trial = plan_training(experiment, composition), None
+    print_notes(plan.files.remarks)
+    if shorter:
+        short, short_composition = compose_experiment([*overrides, *shorter])
+        trial = replace(plan, experiment=short, composition=short_composition)
         start_workers_early(experiment.collector.forks)
 
     from rich.console import Console
 
     from deepracer_exp.validation.validate import validate_reward
 
-    return validate_reward(experiment, trial, args.output, args.strict, Console(), Console(stderr=True))
+    return validate_reward(plan, trial, args.output, args.strict, Console(), Console(stderr=True))
 
 
 def _trial_overrides(given: str) -> list[str]:

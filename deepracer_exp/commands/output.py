@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from deepracer_exp.errors import count
+from deepracer_exp.errors import BadInput, count
 from deepracer_exp.runs.files import BEST_LAP, CHECKPOINTS, LEARNING, METRICS, REPORT, read_metrics
 from deepracer_exp.runs.result import FAILED, RELIABLE, fastest_reliable
 
@@ -25,6 +25,25 @@ _FILES = {
     BEST_LAP: "the fastest exploring lap, or the longest attempt",
     LEARNING: "the learning curves",
 }
+
+
+_WRITTEN = {
+    "": "a file in a folder",
+    ".mp4": "an .mp4 in an existing folder",
+    ".html": "the name of a page (.html) in a folder",
+}
+"""What is accepted as a file to write, by the ending that it must have."""
+
+
+def check_file(flag: str, file: str | None, ending: str = "") -> None:
+    """Check where a file is to be written, if anywhere.
+
+    Raises:
+        BadInput: its name has not the ending, or its folder does not exist.
+    """
+    if file is None or (file.endswith(ending) and Path(file).absolute().parent.is_dir()):
+        return
+    raise BadInput(f"{flag} {file}", "" if ending else "its folder does not exist", _WRITTEN[ending])
 
 
 def table_console(piped_width: int = 200) -> "Console":

@@ -1,12 +1,17 @@
-"""What `analyze` and `compare` share: the runs and logs they take, and the pages they write."""
+"""What `analyze`, `compare` and `watch` share: the runs and logs they take, and the pages they write."""
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from deepracer_exp.errors import BadInput, reading
+from deepracer_exp.errors import BadInput, reading, writing
 from deepracer_exp.files import LOG_BYTES, open_user_file
 
 from .arguments import Stores
+
+if TYPE_CHECKING:
+    from deepracer_exp.reports.lap_replay import ReplayedLap
 
 _ACCEPTED = "logs of the service, or a run"
 
@@ -22,14 +27,23 @@ def add_page(parser: argparse.ArgumentParser, default: str) -> None:
     parser.add_argument("-o", "--output", metavar="FILE", help=f"page to write (default: {default})")
 
 
-def check_output(output: str | None) -> None:
-    """Check where the page is to be written.
+def add_replay(parser: argparse.ArgumentParser, which: str) -> None:
+    """Give a command the flag; `which` says in its help which laps are replayed."""
+    parser.add_argument(
+        "--replay", metavar="PAGE.html", help=f"write a page on which two laps drive side by side: {which}"
+    )
+
+
+def write_laps(page: str, laps: "Sequence[ReplayedLap]") -> None:
+    """Write the page of two laps.
 
     Raises:
-        BadInput: its folder does not exist.
+        BadInput: they are not on the same track, or it cannot be written.
     """
-    if output is not None and not Path(output).absolute().parent.is_dir():
-        raise BadInput(f"--output {output}", "its folder does not exist", "a file in a folder")
+    from deepracer_exp.reports.lap_replay import write_replay
+
+    with writing(f"--replay {page}"):
+        write_replay(Path(page), laps)
 
 
 def page_name(kind: str, name: str) -> Path:
@@ -73,9 +87,8 @@ def run_or_logs(what: str, stores: Stores) -> Path:
     path = existing_logs(what)
     if path is not None:
         return path
-    from deepracer_exp.lookup.resolve import resolve
 
     try:
-        return resolve(what, stores.runs_dir, stores.uri).path
+        return stores.find(what).path
     except BadInput as error:
         raise BadInput(what, f"no such file or folder, and no run: {error.without(what)}") from None

@@ -142,12 +142,11 @@ def _lineage(args: argparse.Namespace) -> int:
     from rich.table import Table
     from rich.tree import Tree
 
-    from deepracer_exp.lookup.resolve import resolve
     from deepracer_exp.runs.lineage import best_by_generation, best_members, family
 
     name, overrides = run_and_overrides(args)
     stores = read_stores(overrides)
-    run = resolve(name, stores.runs_dir, stores.uri).path
+    run = stores.find(name).path
     root = family(run, stores.runs_dir)
     best = best_members(root)
 
@@ -212,7 +211,6 @@ def _promote(args: argparse.Namespace) -> int:
     from deepracer_exp.config.own_class import OF_POLICY, allow_given
     from deepracer_exp.config.parse import parse_config
     from deepracer_exp.lookup.next_steps import command_line
-    from deepracer_exp.lookup.resolve import resolve
     from deepracer_exp.runs.checkpoint_files import find_checkpoint
     from deepracer_exp.runs.files import read_config
     from deepracer_exp.tracking.registry import check_alias, check_model, promote
@@ -222,7 +220,7 @@ def _promote(args: argparse.Namespace) -> int:
     check_alias("--alias", args.alias)
     if args.model is not None:
         check_model("--model", args.model)
-    run = resolve(name, stores.runs_dir, stores.uri)
+    run = stores.find(name)
     checkpoint = stores.values.get("checkpoint") or run.checkpoint or "best"
     find_checkpoint(run.checkpoints, checkpoint)
 

@@ -68,7 +68,6 @@ def add_edits(actions: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
 
 
 def _send(args: argparse.Namespace) -> int:
-    from deepracer_exp.lookup.resolve import resolve
     from deepracer_exp.tracking.delivery import deliver, is_delivered, undelivered
     from deepracer_exp.tracking.store import resolve_store
     from deepracer_exp.tracking.tracking_file import read_tracked_run
@@ -76,7 +75,7 @@ def _send(args: argparse.Namespace) -> int:
     runs, overrides = runs_and_overrides(args)
     stores = read_stores(overrides)
     store = resolve_store(stores.uri, stores.runs_dir)
-    named = [resolve(run, stores.runs_dir, stores.uri).path for run in runs]
+    named = [stores.find(run).path for run in runs]
     for folder in named:
         recorded = read_tracked_run(folder / TRACKING).store
         # What a run names as its store may be a stranger's, who would be given this user's password.
@@ -147,12 +146,11 @@ class _Target:
 
 
 def _target(name: str, stores: Stores) -> _Target:
-    from deepracer_exp.lookup.resolve import resolve
     from deepracer_exp.runs.files import read_run_id
     from deepracer_exp.tracking.store import is_run_id
 
     try:
-        folder = resolve(name, stores.runs_dir, stores.uri).path
+        folder = stores.find(name).path
     except BadInput:
         if not is_run_id(name):
             raise
@@ -205,7 +203,6 @@ def _tag(args: argparse.Namespace) -> int:
 def _delete(args: argparse.Namespace) -> int:
     from rich.filesize import decimal
 
-    from deepracer_exp.lookup.resolve import resolve
     from deepracer_exp.runs.clean import deletable, remove, total_bytes
     from deepracer_exp.runs.files import read_run_id
     from deepracer_exp.tracking.delivery import marked_deleted
@@ -214,7 +211,7 @@ def _delete(args: argparse.Namespace) -> int:
     stores = read_stores(overrides)
     if not runs:
         raise BadInput("RUN: missing; write deepracer-exp runs delete RUN")
-    folders = dict.fromkeys(resolve(run, stores.runs_dir, stores.uri).path for run in runs)
+    folders = dict.fromkeys(stores.find(run).path for run in runs)
     items = [deletable(folder, stores.runs_dir) for folder in folders]
     for item in items:
         print(f"{decimal(item.size):>10}  {item.run}")

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 from deepracer_exp.errors import BadInput, writing
 
 from .arguments import add_command, add_overrides, is_override
-from .evaluate import check_film, choose_graphics
+from .evaluate import choose_graphics
 from .files import picture_file
-from .output import print_notes, table_console
+from .output import check_file, print_notes, table_console
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -135,8 +135,8 @@ def _show_track(args: argparse.Namespace) -> None:
 
     is_file = Path(args.name).suffix in ROUTES
     check_line_file(args.line)
+    check_file("--video", args.video, ".mp4")
     if args.video is not None:
-        check_film("--video", Path(args.video))
         choose_graphics()
     experiment, track = experiment_on(
         [override_line("track.file" if is_file else "track", args.name), *args.overrides]

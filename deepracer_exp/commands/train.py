@@ -5,6 +5,7 @@ import shlex
 import sys
 import traceback
 
+from deepracer_exp.collectors.forking import start_workers_early
 from deepracer_exp.errors import BadInput, reading
 
 from .arguments import (
@@ -24,14 +25,6 @@ from .output import (
     print_start,
     print_unsent,
     warnings_on_stderr,
-)
-from .startup import (
-    check_changes,
-    check_files,
-    check_run,
-    check_sweep,
-    check_teacher,
-    start_workers_early,
 )
 
 _TRAIN_EPILOG = """\
@@ -130,30 +123,32 @@ def _train(args: argparse.Namespace) -> int:
     if args.cfg:
         print("---\n".join(composition.yaml() for _, composition in composed), end="")
         return 0
-    for experiment, _ in composed:
-        print_notes(check_files(experiment))
-        check_teacher(experiment)
+
+    from deepracer_exp.training.plan import plan_training
+
+    plans = [plan_training(experiment, composition) for experiment, composition in composed]
+    print_notes(remark for plan in plans for remark in plan.files.remarks)
     print_start()
-    start_workers_early(any(experiment.collector.forks for experiment, _ in composed))
+    start_workers_early(any(plan.experiment.collector.forks for plan in plans))
 
     from rich.console import Console
 
-    from deepracer_exp.training.run import read_files, run_training
+    from deepracer_exp.training.run import run_training, try_out
 
-    if len(composed) > 1:
-        for experiment, _ in composed:
-            read_files(experiment)
+    if len(plans) > 1:
+        for plan in plans:
+            try_out(plan)
     outcomes = []
-    for experiment, composition in composed:
-        outcome = run_training(experiment, composition, Console(stderr=True))
+    for plan in plans:
+        outcome = run_training(plan, Console(stderr=True))
         outcomes.append(outcome)
-        if experiment.debug and outcome.error is not None:
+        if plan.experiment.debug and outcome.error is not None:
             traceback.print_exception(outcome.error)
-        print_result(outcome, experiment.tracking)
+        print_result(outcome, plan.experiment.tracking)
         if outcome.status == "interrupted":
             break
     if args.multirun:
-        print_results(outcomes, composed[0][0].tracking)
+        print_results(outcomes, plans[0].experiment.tracking)
     return max(outcome.exit_code for outcome in outcomes)
 
 
@@ -172,28 +167,23 @@ or money or one that several runs share. A reward function that keeps something 
 
 
 def _resume(args: argparse.Namespace) -> int:
-    from deepracer_exp.config.parse import import_own_classes
-    from deepracer_exp.lookup.resolve import resolve
-    from deepracer_exp.training.budget import refuse_ended
+    from deepracer_exp.training.plan import plan_resume
 
     name, given = run_and_overrides(args)
     stores, changes = split_stores(given)
-    run_dir = resolve(name, stores.runs_dir, stores.uri).path
     # The folder says where the run is, but MLflow may have moved.
     overrides = [*changes, *(one for one in given if one.startswith("tracking.uri="))]
-    experiment = check_changes(run_dir, overrides)
-    refuse_ended(run_dir, experiment.budget, overrides)
-    import_own_classes(experiment)
+    plan = plan_resume(stores.find(name).path, overrides)
     print_start()
-    start_workers_early(experiment.collector.forks)
+    start_workers_early(plan.experiment.collector.forks)
 
     from rich.console import Console
 
     from deepracer_exp.training.run import resume_training
 
     with warnings_on_stderr():
-        outcome = resume_training(run_dir, overrides, Console(stderr=True))
-    print_result(outcome, experiment.tracking)
+        outcome = resume_training(plan, Console(stderr=True))
+    print_result(outcome, plan.experiment.tracking)
     return outcome.exit_code
 
 
@@ -210,36 +200,25 @@ cannot be changed. `deepracer-exp runs lineage RUN` draws the family tree.
 
 
 def _clone(args: argparse.Namespace) -> int:
-    from deepracer_exp.config.acting import refuse_reward
-    from deepracer_exp.config.parse import import_own_classes
-    from deepracer_exp.runs.files import REWARD
-    from deepracer_exp.runs.lineage import refuse_other_networks
+    from deepracer_exp.training.clone import plan_clone
 
-    run, given = run_and_overrides(args)
+    name, given = run_and_overrides(args)
     checkpoints = [one.partition("=")[2] for one in given if one.startswith("checkpoint=")]
     changes = [one for one in given if not one.startswith("checkpoint=")]
-    stores, _ = split_stores(given)
-    parent = check_run(run, str(stores.runs_dir), stores.uri, checkpoints[-1] if checkpoints else None)
-    experiment = check_changes(parent.path, changes)
-    import_own_classes(experiment)
-    refuse_reward(experiment.reward.file, parent.path.name, parent.path / REWARD)
-    print_notes(check_files(experiment))
-    refuse_other_networks(parent.experiment, experiment)
+    parent = split_stores(changes)[0].find(name)
+    plan = plan_clone(parent.with_checkpoint(checkpoints[-1] if checkpoints else None), changes)
+    args.debug = plan.experiment.debug
+    print_notes((*plan.composition.notes, *plan.files.remarks))
     print_start()
-    start_workers_early(experiment.collector.forks)
+    start_workers_early(plan.experiment.collector.forks)
 
     from rich.console import Console
 
-    from deepracer_exp.training.clone import prepare_clone
     from deepracer_exp.training.run import run_training
 
     with warnings_on_stderr():
-        clone = prepare_clone([f"run={run}", *given], stores.runs_dir, stores.uri)
-    args.debug = clone.experiment.debug
-    for line in clone.notes:
-        print(line, file=sys.stderr)
-    outcome = run_training(clone.experiment, clone.composition, Console(stderr=True), clone.start)
-    print_result(outcome, clone.experiment.tracking)
+        outcome = run_training(plan, Console(stderr=True))
+    print_result(outcome, plan.experiment.tracking)
     return outcome.exit_code
 
 
@@ -278,18 +257,12 @@ _PRELOADED = "deepracer_exp.sweeps.queue.worker"
 def _sweep(args: argparse.Namespace) -> int:
     if args.overrides and args.overrides[0] in _WORDS:
         return _show_study(*args.overrides)
-    from deepracer_exp.config.sweep import compose_sweep
+    from deepracer_exp.sweeps.plan import plan_sweep
 
-    request = compose_sweep(args.overrides)
+    plan = plan_sweep(args.overrides, is_only_shown=args.cfg)
+    request = plan.request
     args.debug = request.entry.debug
-    print_notes(check_sweep(request))
-    if not request.space:  # an existing study has its own
-        from deepracer_exp.sweeps.queue.study import load_request
-        from deepracer_exp.sweeps.search.space import SearchSpace
-
-        _, request, study = load_request(args.overrides)
-        if study is None and not args.cfg:
-            SearchSpace.from_request(request)  # refuses a sweep with nothing to search
+    print_notes(plan.remarks)
     if args.cfg:
         # The overrides of the training are shown where a ready-made sweep has them.
         request.composition.mapping["sweep"] |= {"train": list(request.base), "space": dict(request.space)}
@@ -304,7 +277,7 @@ def _sweep(args: argparse.Namespace) -> int:
     from deepracer_exp.sweeps.sweep import REPORT, sweep
 
     with warnings_on_stderr():
-        study, folder, code = sweep(args.overrides, Console(stderr=True))
+        study, folder, code = sweep(plan, Console(stderr=True))
     if code:
         where = [one for one in args.overrides if one.startswith(("runs_dir=", "sweep.storage="))]
         line = shlex.join(["deepracer-exp", "sweep", f"study={study.study_name}", *where])

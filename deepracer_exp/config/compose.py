@@ -22,7 +22,7 @@ from deepracer_exp.errors import BadInput, Unknown, nearest, reading
 from . import acting, custom_files
 from .custom_files import FileOverrides, file_overrides, read_custom_files
 from .dimension import range_length
-from .evaluation import EvaluateConfig, EvaluationConfig, ExportConfig
+from .evaluation import EvaluateConfig, EvaluationConfig
 from .experiment import Experiment
 from .option_files import change, composed, composed_option, first_line, plain
 from .options import groups, listed, options
@@ -93,21 +93,6 @@ def compose_evaluation(overrides: Sequence[str]) -> tuple[EvaluateConfig, Compos
     config = parse_config(composition.mapping, EvaluateConfig)
     _check_names(config.evaluation)
     return config, composition
-
-
-def compose_export(overrides: Sequence[str]) -> tuple[ExportConfig, Composition]:
-    """Compose `conf/export.yaml` with the overrides and validate the result.
-
-    Raises:
-        BadInput: as for `compose_experiment`, or no format is given.
-    """
-    composition = compose_entry("export", overrides)
-    if composition.mapping["format"] is None:
-        raise BadInput(
-            "format: missing; write format=onnx, format=aws, format=aws-model, format=aws-logs, or, for a policy that "
-            "sees with the camera, format=car"
-        )
-    return parse_config(composition.mapping, ExportConfig), composition
 
 
 def compose_entry(entry: str, overrides: Sequence[str], *, stored: bool = False) -> Composition:

@@ -1,4 +1,4 @@
-"""How a policy is evaluated (`conf/evaluation/`), and the entry points of evaluate and export."""
+"""How a policy is evaluated (`conf/evaluation/`), and the entry point of evaluate."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -81,26 +81,11 @@ class StoreConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class StoredRunConfig:
-    """A stored run, where it is looked up, and which of its checkpoints is meant."""
+class EvaluateConfig:
+    """The request of `deepracer-exp evaluate`: how to race, which checkpoint, and where its run is looked up."""
 
-    run: Annotated[str, Field(min_length=1)]
+    evaluation: EvaluationConfig
     checkpoint: Annotated[str, Field(min_length=1)] | None
     runs_dir: Annotated[str, Field(min_length=1)]
     tracking: StoreConfig
     debug: bool
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvaluateConfig(StoredRunConfig):
-    """The request of `deepracer-exp evaluate`."""
-
-    evaluation: EvaluationConfig
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExportConfig(StoredRunConfig):
-    """The request of `deepracer-exp export`."""
-
-    format: Literal["onnx", "car", "aws", "aws-model", "aws-logs"]
-    layout: Literal["console", "deepracer-for-cloud"]

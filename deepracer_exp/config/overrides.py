@@ -18,8 +18,8 @@ OPEN_MAPPINGS = ("reward.constants", *(f"{group}.kwargs" for group in GROUPS))
 # equals sign in a value, and a comma makes a sweep.
 PLAIN_TEXT = (
     *("track.file", "reward.file", "action_space.file", "custom_files", "runs_dir", "tracking.uri"),
-    # Of commands that read runs; an id may look like a number.
-    *("run", "checkpoint"),
+    # Of commands that read runs; the number of an iteration has leading zeros.
+    "checkpoint",
     # Of sweeps.
     *("study", "parent", "sweep.storage"),
 )

@@ -125,6 +125,18 @@ class SweepRequest:
         option = self.composition.choices[_ENTRY]
         return self.entry.study or (_ENTRY if option == "own" else option)
 
+    def refuse_empty(self) -> None:
+        """Refuse a sweep with nothing to search.
+
+        Raises:
+            BadInput: there is nothing to search.
+        """
+        if not self.space:
+            raise BadInput(
+                "sweep",
+                "nothing to search; write KEY='interval(LOW,HIGH)', KEY=A,B or sweep=NAME, such as sweep=lr_entropy",
+            )
+
     @cached_property
     def protocol(self) -> EvaluationConfig:
         """The protocol by which trials are judged.
@@ -132,7 +144,7 @@ class SweepRequest:
         Raises:
             BadInput: as `compose_evaluation`.
         """
-        return compose_evaluation(["run=any", f"evaluation={self.entry.sweep.protocol}"])[0].evaluation
+        return compose_evaluation([f"evaluation={self.entry.sweep.protocol}"])[0].evaluation
 
     @cached_property
     def runs_dir(self) -> Path:

@@ -1,8 +1,9 @@
 """Everything a race needs, built once from an experiment and sent to every process: courses, car, actions, reward."""
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +12,12 @@ from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.driving import EpisodeConfig, ObservationConfig, RandomizationConfig
 from deepracer_exp.config.evaluation import RealCarConfig
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.config.track import TrackConfig
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.source import RewardSource, load_reward_source
-from deepracer_exp.tracks.track import Track
+from deepracer_exp.tracks.track import Track, directed_tracks
 
 from .action_space import ActionSpace, build_action_space
+from .files import RaceFiles
 from .observation import ObservationPart, build_parts
 
 
@@ -31,14 +32,16 @@ class Course:
     """One per direction; two directions alternate from episode to episode."""
 
 
-def build_courses(experiment: Experiment) -> tuple[Course, ...]:
-    """Build the courses of an experiment.
+def build_courses(
+    experiment: Experiment, built: Mapping[str, tuple[Track, ...]] = MappingProxyType({})
+) -> tuple[Course, ...]:
+    """Build the courses of an experiment; those tracks that are `built` already are taken as they are.
 
     Raises:
         BadInput: a route is missing or malformed, or an open course is not started at its start.
     """
     courses = tuple(
-        Course(name=name, weight=config.weight, tracks=directed_tracks(config))
+        Course(name=name, weight=config.weight, tracks=built.get(name) or directed_tracks(config))
         for name, config in experiment.tracks.items()
     )
     for course in courses:
@@ -48,12 +51,6 @@ def build_courses(experiment: Experiment) -> tuple[Course, ...]:
                 "be completed from its start; accepted: 0"
             )
     return courses
-
-
-def directed_tracks(config: TrackConfig) -> tuple[Track, ...]:
-    """Build a track in each direction in which it is driven, the one of the first episode first."""
-    directions = {"forward": (False,), "reversed": (True,), "alternate": (False, True)}[config.direction]
-    return tuple(Track.from_config(config, backwards) for backwards in directions)
 
 
 def deal(weights: Sequence[float]) -> Iterator[int]:
@@ -107,22 +104,25 @@ class RaceSetup:
 
 
 def build_setup(
-    experiment: Experiment, courses: tuple[Course, ...] | None = None, reward: RewardSource | None = None
+    experiment: Experiment,
+    courses: tuple[Course, ...] | None = None,
+    reward: RewardSource | None = None,
+    files: RaceFiles | None = None,
 ) -> RaceSetup:
-    """Read the files that an experiment names and build its race; `courses` and `reward` replace its own.
+    """Build the race of an experiment; `courses` and `reward` replace its own, files that were not read are read.
 
     Raises:
         BadInput: a route, model_metadata or reward file is missing or malformed, or values contradict.
     """
     return RaceSetup(
-        courses=courses or build_courses(experiment),
+        courses=courses or build_courses(experiment, {} if files is None else files.tracks),
         car=experiment.car,
-        actions=build_action_space(experiment.action_space),
+        actions=build_action_space(experiment.action_space) if files is None else files.actions,
         observation=experiment.observation,
         observation_parts=build_parts(experiment.observation),
         randomization=experiment.randomization,
         episode=experiment.episode,
-        reward=reward or load_reward_source(experiment.reward),
+        reward=reward or (load_reward_source(experiment.reward) if files is None else files.reward),
         reward_time_limit_s=experiment.reward.time_limit_s,
         seed=experiment.seed,
     )

@@ -12,14 +12,13 @@ from rich.console import Console
 from rich.table import Table
 
 from deepracer_exp.aws.models.car_controls import full_scale, throttle
-from deepracer_exp.config.evaluation import EvaluateConfig, EvaluationConfig, RealCarConfig
+from deepracer_exp.config.evaluation import EvaluationConfig, RealCarConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.running import MLflowTracking
 from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.errors import RunFailed, count, writing
 from deepracer_exp.files import atomic_write
-from deepracer_exp.lookup.resolve import StoredRun
-from deepracer_exp.runs.checkpoints import StoredPolicy, read_checkpoint
+from deepracer_exp.runs.checkpoints import StoredPolicy
 from deepracer_exp.runs.files import EVALUATIONS, FILMS
 from deepracer_exp.tracking.delivery import deliver_evaluation
 from deepracer_exp.tracking.metrics import evaluate_metric, track_labels
@@ -27,6 +26,7 @@ from deepracer_exp.tracks.boards import Standing, standings, what_it_sees
 
 from .evaluator import Evaluator, tracks_of
 from .film import LapRecorder, best_attempt
+from .plan import EvaluatePlan
 from .result import CONFIDENCE, NOTHING, USUAL, Evaluation, number, zigzag_columns
 
 _TIMES = ("lap s", "median", "best", "std", "score s")
@@ -156,18 +156,17 @@ def _mean(statistics: Mapping[str, Any], digits: int, intervals: bool) -> str:
     return mean if low == high else f"{mean} ({low}\N{EN DASH}{high})"
 
 
-def evaluate_run(
-    run: StoredRun, config: EvaluateConfig, video: Path | None, out: Console, err: Console
-) -> Evaluation:
+def evaluate_run(plan: EvaluatePlan, video: Path | None, out: Console, err: Console) -> Evaluation:
     """Race a run's checkpoint under a protocol, print the table, write the JSON file, record both in MLflow.
 
     Raises:
         BadInput: the checkpoint, a track or a condition cannot be used, or the machine cannot render.
         RunFailed: a car's state became NaN, or a file cannot be written.
     """
-    stored = read_checkpoint(run.experiment, run.checkpoints, run.choose_checkpoint(config.checkpoint))
+    run, config = plan.run, plan.config.evaluation
+    stored = run.read_policy()
     torch.set_num_threads(1)
-    evaluator = Evaluator(run.experiment, config.evaluation)
+    evaluator = Evaluator(run.experiment, config)
     recorder = LapRecorder(evaluator)
     err.print(
         f"{run.path.name}, checkpoint {stored.path.name}: {count(len(evaluator.trials), 'trial')}",
@@ -175,16 +174,16 @@ def evaluate_run(
     )
     evaluation = evaluator(stored.networks.policy, recorder if video is not None else None)
     car = None
-    if config.evaluation.real_car is not None:
-        car = race_car_parts(run.experiment, config.evaluation, stored.networks.policy, evaluation)
-    places = official_places(run.experiment, config.evaluation, evaluation)
-    file = write_evaluation(run.path, evaluation, config.evaluation, stored, car, places)
-    trained = trained_on(run.experiment, config.evaluation, evaluation)
-    out.print(results_table(evaluation, config.evaluation, trained, out))
+    if config.real_car is not None:
+        car = race_car_parts(run.experiment, config, stored.networks.policy, evaluation)
+    places = official_places(run.experiment, config, evaluation)
+    file = write_evaluation(run.path, evaluation, config, stored, car, places)
+    trained = trained_on(run.experiment, config, evaluation)
+    out.print(results_table(evaluation, config, trained, out))
     if car is not None:
         out.print()
         out.print(car_table(car))
-        for line in explain_controls(run.experiment, config.evaluation):
+        for line in explain_controls(run.experiment, config):
             out.print(f"  {line}", soft_wrap=True, highlight=False)
     for track, on_track in places.items():
         laps = next(group for group in evaluation.groups if group.track == track and group.condition == USUAL)
@@ -202,7 +201,7 @@ def evaluate_run(
         out.print(f"  video    {video}", soft_wrap=True, highlight=False)
         files[video] = FILMS
     tracking = run.experiment.tracking
-    uri = config.tracking.uri or (tracking.uri if isinstance(tracking, MLflowTracking) else None)
+    uri = plan.config.tracking.uri or (tracking.uri if isinstance(tracking, MLflowTracking) else None)
     metrics = _metrics(evaluation, trained)
     runs_dir = run.path.resolve().parent.parent
     deliver_evaluation(run.path, uri, runs_dir, stored.counters["env_steps"], metrics, files)

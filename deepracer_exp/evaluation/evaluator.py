@@ -18,10 +18,11 @@ from deepracer_exp.config.overrides import override_line
 from deepracer_exp.config.track import TrackConfig
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.real_car import as_the_car, require_car
-from deepracer_exp.env.setup import Course, build_setup, directed_tracks
+from deepracer_exp.env.setup import Course, build_setup
 from deepracer_exp.env.trace import PACKED, STATUS_CODE
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.source import NO_REWARD
+from deepracer_exp.tracks.track import directed_tracks
 
 from .race_protocol import RaceProtocol
 from .result import HELD_OUT, USUAL, Evaluation, TrialGroup

@@ -14,7 +14,6 @@ from deepracer_exp.aws.models.model_metadata import (
 )
 from deepracer_exp.config.custom_files import CARS, TAKEN
 from deepracer_exp.config.driving import ObservationConfig
-from deepracer_exp.config.evaluation import ExportConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.lookup.resolve import StoredRun
@@ -23,7 +22,7 @@ from deepracer_exp.validation.aws_rules import text_findings
 from .written import Written, reward_text, write_files
 
 
-def export_files(run: StoredRun, _: ExportConfig, folder: Path) -> Written:
+def export_files(run: StoredRun, _: str, folder: Path) -> Written:
     """Write the files that a training on AWS starts from; arguments, result and errors as for `export.Writer`."""
     reward = reward_text(run)
     texts, notes = aws_files(run.experiment, reward)

@@ -17,7 +17,6 @@ from deepracer_exp.aws.logs.writer import (
 )
 from deepracer_exp.aws.models.hyperparameters import hyperparameters_text
 from deepracer_exp.aws.models.model_metadata import model_metadata_text
-from deepracer_exp.config.evaluation import ExportConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.rules import lap_clock_s
 from deepracer_exp.errors import BadInput, count, writing
@@ -28,10 +27,10 @@ from .aws_files import hyperparameters_of, services_metadata
 from .written import Written, write_files
 
 
-def export_logs(run: StoredRun, config: ExportConfig, folder: Path) -> Written:
+def export_logs(run: StoredRun, layout: str, folder: Path) -> Written:
     """Write the logs of a run's training; arguments, result and errors as for `export.Writer`."""
     log = read_run_recording(run.path)
-    notes = write_aws_logs(log, run.experiment, folder, config.layout)
+    notes = write_aws_logs(log, run.experiment, folder, layout)
     return [folder], [*notes, *map(str, log.recording.problems)]
 
 

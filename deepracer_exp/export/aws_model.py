@@ -18,7 +18,6 @@ from deepracer_exp.aws.models.model_metadata import (
 from deepracer_exp.aws.worlds.catalogue import find_world
 from deepracer_exp.config.compose import compose_option
 from deepracer_exp.config.custom_files import services_network
-from deepracer_exp.config.evaluation import ExportConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.learning import CNNConfig
 from deepracer_exp.env.action_space import build_action_space
@@ -30,15 +29,15 @@ from deepracer_exp.runs.result import read_result
 from deepracer_exp.tracks.track import Track
 
 from .aws_files import aws_files, services_metadata
-from .written import Written, reward_text, stored_policy, write_files
+from .written import Written, reward_text, write_files
 
 _PIXELS = 160, 120
 _LAYERS = ("filters", "kernels", "strides", "hidden", "lidar_hidden")
 
 
-def export_model(run: StoredRun, config: ExportConfig, folder: Path) -> Written:
+def export_model(run: StoredRun, _: str, folder: Path) -> Written:
     """Write a pretrained model of the service; arguments, result and errors as for `export.Writer`."""
-    stored = stored_policy(run, config)
+    stored = run.read_policy()
     result = read_result(run.path)
     score = result.completion if result and result.iteration == stored.counters["iteration"] else None
     files, notes = aws_model(run.experiment, stored, reward_text(run), score)

@@ -25,7 +25,6 @@ from deepracer_exp.aws.models.car_controls import full_scale
 from deepracer_exp.aws.models.graph_def import HEAD, policy_graph
 from deepracer_exp.aws.models.model_metadata import Action, ModelMetadata, model_metadata_text
 from deepracer_exp.config.driving import LidarConfig
-from deepracer_exp.config.evaluation import ExportConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.learning import CNNConfig
 from deepracer_exp.env.action_space import ActionSpace, ContinuousActions, build_action_space, metadata_of
@@ -35,7 +34,7 @@ from deepracer_exp.lookup.resolve import StoredRun
 
 from .aws_files import sensor_keys
 from .aws_model import services_kind
-from .written import Written, checkpoint_line, stored_policy, write_file
+from .written import Written, checkpoint_line, write_file
 
 
 class Rescaling(NamedTuple):
@@ -54,13 +53,13 @@ class CarArchive(NamedTuple):
     """One for each change, and for each thing that the car does differently."""
 
 
-def export_car(run: StoredRun, config: ExportConfig, path: Path) -> Written:
+def export_car(run: StoredRun, _: str, path: Path) -> Written:
     """Write the archive of a policy for a physical car; arguments, result and errors as for `export.Writer`."""
     if not path.name.endswith(ENDING) or path.is_dir():
         raise BadInput(
             f"--output {path}", "", f"a file whose name ends in {ENDING}, as the car's console wants it"
         )
-    stored = stored_policy(run, config)
+    stored = run.read_policy()
     archive = car_archive(stored.networks, run.experiment)
     write_file(path, archive.content)
     return [path], [

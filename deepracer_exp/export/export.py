@@ -5,7 +5,6 @@ from pathlib import Path
 
 from rich.console import Console
 
-from deepracer_exp.config.evaluation import ExportConfig
 from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.files import EXPORTS
 
@@ -16,8 +15,8 @@ from .car_archive import export_car, name_in_exports
 from .onnx import export_onnx
 from .written import Written
 
-Writer = Callable[[StoredRun, ExportConfig, Path], Written]
-"""Writes a run to a file or a folder.
+Writer = Callable[[StoredRun, str, Path], Written]
+"""Writes a run, in a folder layout where the format has several, to a file or a folder.
 
 Raises BadInput where the checkpoint or the output cannot be used, or a package is missing; RunFailed where the written
 file differs from the network.
@@ -32,11 +31,11 @@ WRITERS: Mapping[str, tuple[Writer, Callable[[StoredRun], str]]] = {
 """The writer of each format, and what it writes into the run's folder of exports where no output is given."""
 
 
-def export(run: StoredRun, config: ExportConfig, output: str | None, out: Console) -> Path:
-    """Export a run in the chosen format and print what was written; errors as for `Writer`."""
-    write, name = WRITERS[config.format]
+def export(run: StoredRun, format: str, layout: str, output: str | None, out: Console) -> Path:
+    """Export a run in a format and print what was written; errors as for `Writer`."""
+    write, name = WRITERS[format]
     path = Path(output or run.path / EXPORTS / name(run))
-    files, lines = write(run, config, path)
+    files, lines = write(run, layout, path)
     for line in (*map(str, files), *(f"  {line}" for line in lines)):
         out.print(line, soft_wrap=True)
     return path

@@ -13,13 +13,12 @@ from torch import Tensor, nn
 
 from deepracer_exp.agents.actor_critic import ActorCritic, SensorNet
 from deepracer_exp.config.driving import ObservationShape
-from deepracer_exp.config.evaluation import ExportConfig
 from deepracer_exp.env.action_space import ActionSpace, DiscreteActions, build_action_space
 from deepracer_exp.env.observation import feature_names, observation_shape
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.lookup.resolve import StoredRun
 
-from .written import Written, checkpoint_line, stored_policy, write_file
+from .written import Written, checkpoint_line, write_file
 
 POLICY, COMMAND = "policy", "command"
 CHECKED, CHECKED_PICTURES = 1000, 100
@@ -28,11 +27,11 @@ TOLERANCE = 1e-4
 """Largest accepted difference, with a margin over single-precision rounding."""
 
 
-def export_onnx(run: StoredRun, config: ExportConfig, path: Path) -> Written:
+def export_onnx(run: StoredRun, _: str, path: Path) -> Written:
     """Write the policy of a run as an ONNX file; arguments, result and errors as for `export.Writer`."""
     if path.is_dir():
         raise BadInput(f"--output {path}", f"is a folder; give a file, e.g. {path / 'policy.onnx'}")
-    stored = stored_policy(run, config)
+    stored = run.read_policy()
     actions = build_action_space(run.experiment.action_space)
     torch.set_num_threads(1)
     facts: dict[str, Any] = {

@@ -3,20 +3,14 @@
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from deepracer_exp.config.evaluation import ExportConfig
 from deepracer_exp.errors import writing
 from deepracer_exp.files import atomic_write, read_text
 from deepracer_exp.lookup.resolve import StoredRun
-from deepracer_exp.runs.checkpoints import StoredPolicy, read_checkpoint
+from deepracer_exp.runs.checkpoints import StoredPolicy
 from deepracer_exp.runs.files import REWARD
 
 Written = tuple[Iterable[Path], list[str]]
 """Files or folders, and lines on them."""
-
-
-def stored_policy(run: StoredRun, config: ExportConfig) -> StoredPolicy:
-    """Return the policy of the chosen checkpoint of a run."""
-    return read_checkpoint(run.experiment, run.checkpoints, run.choose_checkpoint(config.checkpoint))
 
 
 def checkpoint_line(stored: StoredPolicy) -> str:

@@ -1,20 +1,32 @@
-"""Which run a name, an id, `best:EXPERIMENT` or a registered alias stands for."""
+"""Which run a name, an id, `best:EXPERIMENT` or a registered alias stands for, and which checkpoint of it is meant."""
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from deepracer_exp.config import acting
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.own_class import OF_POLICY
+from deepracer_exp.config.parse import import_own_classes, parse_experiment
 from deepracer_exp.errors import BadInput, nearest, reading
-from deepracer_exp.runs.checkpoint_files import LINKS, checkpoint_sha256, restore_links, verify
+from deepracer_exp.runs.checkpoint_files import (
+    LINKS,
+    checkpoint_sha256,
+    find_checkpoint,
+    restore_links,
+    verify,
+)
 from deepracer_exp.runs.files import BEST, CHECKPOINTS, CONFIG, RUN, is_run, read_config, run_folders
 from deepracer_exp.runs.labels import named_folders
 from deepracer_exp.tracking.registry import Registered, download_folder, fetch, is_alias, look_up
 from deepracer_exp.tracking.store import has_store, is_run_id, open_client
 
 from .best import best_of
+
+if TYPE_CHECKING:
+    from deepracer_exp.runs.checkpoints import StoredPolicy
 
 logger = logging.getLogger("deepracer_exp")
 
@@ -25,7 +37,9 @@ class StoredRun:
 
     path: Path
     checkpoint: str | None = None
-    """Name of the checkpoint, if the run was given by a registered model's alias."""
+    """Name of the checkpoint that is meant: `best`, `last` or an iteration; None: not chosen."""
+    was_never_evaluated: bool = False
+    """Whether the checkpoint is `last` only because the run ended before it had a best one."""
     registered: str | None = None
     """That alias, as MODEL@ALIAS."""
 
@@ -36,8 +50,6 @@ class StoredRun:
         Raises:
             BadInput: it cannot be read, or was written by another version.
         """
-        from deepracer_exp.config.parse import parse_experiment
-
         mapping = read_config(self.path)
         acting.leave_out_foreign(mapping, self.path.name)
         try:
@@ -51,20 +63,47 @@ class StoredRun:
         restore_links(self.path / CHECKPOINTS)
         return self.path / CHECKPOINTS
 
-    def choose_checkpoint(self, given: str | None) -> str:
-        """Return the name of the checkpoint to use.
+    def with_checkpoint(self, name: str | None = None) -> "StoredRun":
+        """Return the run with the checkpoint to use.
 
-        `given` is `best`, `last` or an iteration; None: the alias's, or the best. A run that ended before its first
-        evaluation has no best: its last is used, with a warning.
+        `name` is `best`, `last` or an iteration; None: the alias's, or the best. A run that ended before its first
+        evaluation has no best: its last is used, with a warning when it is read.
+
+        Raises:
+            BadInput: there is no such checkpoint.
         """
-        name = given or self.checkpoint
-        best, last = (self.checkpoints / link for link in LINKS)
-        if name is None and not (best.is_symlink() or best.exists()) and last.exists():
+        folder, name = self.checkpoints, name or self.checkpoint
+        best, last = (folder / link for link in LINKS)
+        only_last = name is None and not (best.is_symlink() or best.exists()) and last.exists()
+        name = "last" if only_last else name or "best"
+        find_checkpoint(folder, name)
+        return replace(self, checkpoint=name, was_never_evaluated=only_last)
+
+    def with_policy(self, checkpoint: str | None = None) -> "StoredRun":
+        """Return the run as `with_checkpoint` does; import the classes of the user's own that its policy needs.
+
+        Raises:
+            BadInput: there is no such checkpoint, another version wrote the configuration, or a class is not named
+                again or cannot be imported.
+        """
+        chosen = self.with_checkpoint(checkpoint)
+        import_own_classes(chosen.experiment, OF_POLICY)
+        return chosen
+
+    def read_policy(self) -> "StoredPolicy":
+        """Read the networks of the chosen checkpoint, or of the newest intact one if `best` or `last` is corrupt.
+
+        Raises:
+            BadInput: the checkpoint is corrupt or does not fit the configuration.
+        """
+        from deepracer_exp.runs.checkpoints import read_checkpoint  # imports PyTorch
+
+        if self.was_never_evaluated:
             logger.warning(
                 "%s: ended before its policy was evaluated, so checkpoint=last is used", self.path.name
             )
-            return "last"
-        return name or "best"
+        assert self.checkpoint is not None
+        return read_checkpoint(self.experiment, self.checkpoints, self.checkpoint)
 
 
 def resolve(run: str, runs_dir: Path, tracking_uri: str | None) -> StoredRun:
@@ -79,6 +118,8 @@ def resolve(run: str, runs_dir: Path, tracking_uri: str | None) -> StoredRun:
     Raises:
         BadInput: no run or several match, or a registered checkpoint has changed since.
     """
+    if not run.strip():
+        raise BadInput(repr(run), "names nothing", RUN)
     if run.startswith(BEST):
         return StoredRun(best_of(run.removeprefix(BEST), runs_dir))
     with reading(run, RUN):
@@ -86,7 +127,7 @@ def resolve(run: str, runs_dir: Path, tracking_uri: str | None) -> StoredRun:
             if is_run(folder):
                 return StoredRun(folder)
     if is_run_id(run):
-        return StoredRun(_present(run, folder_of(run, tracking_uri, runs_dir), runs_dir))
+        return StoredRun(_recorded(run, runs_dir, tracking_uri))
     if "@" in run and "/" not in run:
         return _of_registered(run, look_up(run, tracking_uri, runs_dir), runs_dir, tracking_uri)
     folders = run_folders(runs_dir)
@@ -125,28 +166,23 @@ def _of_registered(run: str, found: Registered, runs_dir: Path, tracking_uri: st
             f"{checkpoint} is not the checkpoint that was registered as {found}, version {found.version}: its hash "
             "differs; give the run and checkpoint= to use it anyway",
         )
-    return StoredRun(path, found.checkpoint, str(found))
+    return StoredRun(path, found.checkpoint, registered=str(found))
 
 
-def _present(run: str, folder: Path, runs_dir: Path) -> Path:
-    """Return the folder of a recorded run, where it is or where all runs have moved to."""
-    moved = runs_dir / folder.parent.name / folder.name
-    found = next((place for place in (folder, moved) if is_run(place)), None)
-    if found is None:
-        raise BadInput(run, f"its folder {folder} is gone; give the folder where it is now")
-    return found
-
-
-def folder_of(run_id: str, uri: str | None, runs_dir: Path) -> Path:
-    """Return the folder of a recorded run in a store as of `open_client`.
+def _recorded(run: str, runs_dir: Path, tracking_uri: str | None) -> Path:
+    """Return the folder of the run with an id, where it was recorded or where all runs have moved to.
 
     Raises:
-        BadInput: the store has no such run, it was deleted there, or the store does not answer.
+        BadInput: the store has no such run, it was deleted there, the store does not answer, or the folder is gone.
     """
-    with open_client(run_id, uri, runs_dir) as client:
-        run = client.get_run(run_id)
-    if run.info.lifecycle_stage != "active":
-        raise BadInput(run_id, "was deleted in MLflow; restore it there")
-    if "run_dir" not in run.data.tags:
-        raise BadInput(run_id, "has no tag run_dir, so it is not a run of deepracer-exp")
-    return Path(run.data.tags["run_dir"])
+    with open_client(run, tracking_uri, runs_dir) as client:
+        recorded = client.get_run(run)
+    if recorded.info.lifecycle_stage != "active":
+        raise BadInput(run, "was deleted in MLflow; restore it there")
+    if "run_dir" not in recorded.data.tags:
+        raise BadInput(run, "has no tag run_dir, so it is not a run of deepracer-exp")
+    folder = Path(recorded.data.tags["run_dir"])
+    for place in (folder, runs_dir / folder.parent.name / folder.name):
+        if is_run(place):
+            return place
+    raise BadInput(run, f"its folder {folder} is gone; give the folder where it is now")

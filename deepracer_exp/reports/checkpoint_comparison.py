@@ -14,7 +14,7 @@ from rich.table import Table
 
 from deepracer_exp.analysis.charts.runs import evaluated_laps, speed_and_stability
 from deepracer_exp.analysis.log_tables import Table as PageTable
-from deepracer_exp.config.evaluation import EvaluateConfig
+from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.errors import BadInput, count, writing
 from deepracer_exp.evaluation.evaluate import fit
 from deepracer_exp.evaluation.evaluator import Evaluator
@@ -241,11 +241,9 @@ _LEGEND = (
 
 
 def show_checkpoints(
-    run: StoredRun, config: EvaluateConfig, own_trials: bool, picture: str | None, out: Console, err: Console
+    run: StoredRun, protocol: EvaluationConfig, picture: str | None, out: Console, err: Console
 ) -> None:
     """Evaluate a run's checkpoints, print the comparison, recommend one, and draw them on the page `picture`.
-
-    The trials are those of the training (`own_trials`) or of `config`.
 
     Raises:
         BadInput: all its checkpoints, a track or a condition cannot be used, or a file cannot be written.
@@ -258,7 +256,7 @@ def show_checkpoints(
         if link.is_symlink() and not link.exists():
             logger.warning("%s is a broken link", link)
     torch.set_num_threads(1)
-    evaluator = Evaluator(run.experiment, run.experiment.evaluation if own_trials else config.evaluation)
+    evaluator = Evaluator(run.experiment, protocol)
     err.print(
         f"{run.path.name}: {count(len(kept), 'checkpoint')}, {count(len(evaluator.trials), 'trial')} each",
         soft_wrap=True,

@@ -25,7 +25,6 @@ from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.film import LapRecorder
 from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.reports.against_log import AgainstLog, laps_on, logged_laps
-from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.tracks.track import Track
 
 STREAM = "simulated"
@@ -37,10 +36,8 @@ _LEAST_S = 60.0
 """... and this long in any case."""
 
 
-def race_against_log(
-    run: StoredRun, checkpoint: str | None, view: LogView, given: str | None, err: Console
-) -> AgainstLog:
-    """Race a run's policy as the laps of a log, which `prepare_races` returned, were driven.
+def race_against_log(run: StoredRun, view: LogView, given: str | None, err: Console) -> AgainstLog:
+    """Race the policy of a run's chosen checkpoint as the laps of a log, which `prepare_races` returned, were driven.
 
     `given` is the name or the file of the course; None: that of the log.
 
@@ -51,7 +48,7 @@ def race_against_log(
     config, track = course_driven(view, run.experiment, given)
     course = numbered_as_logged(track, view.steps)
     logged = logged_laps(view, course)
-    stored = read_checkpoint(run.experiment, run.checkpoints, run.choose_checkpoint(checkpoint))
+    stored = run.read_policy()
     torch.set_num_threads(1)
     err.print(
         f"{run.path.name}, checkpoint {stored.path.name}: races as {view.name} was driven", soft_wrap=True
@@ -116,7 +113,7 @@ def race_as_logged(
         RunFailed: an action or a car's state became NaN or infinite.
     """
     starts, laps, longest_s = _races(logged, track)
-    protocol = compose_evaluation(["run=x", "evaluation=aws_virtual"])[0].evaluation
+    protocol = compose_evaluation(["evaluation=aws_virtual"])[0].evaluation
     protocol = replace(
         protocol,
         laps=int(laps.max()),

@@ -17,12 +17,11 @@ from deepracer_exp.evaluation.race_protocol import Attempt
 from deepracer_exp.evaluation.result import USUAL, Evaluation
 from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.reports.lap_replay import ReplayedLap, is_same_start
-from deepracer_exp.runs.checkpoints import StoredPolicy, read_checkpoint
+from deepracer_exp.runs.checkpoints import StoredPolicy
 
 
 def laps_to_replay(
     run: StoredRun,
-    checkpoint: str | None,
     protocol: EvaluationConfig,
     beside: ReplayedLap | None = None,
     ordinary: bool = False,
@@ -30,8 +29,7 @@ def laps_to_replay(
     """Race a run's checkpoint on the usual conditions and return its fastest lap, or the one that came farthest.
 
     Args:
-        run: trained.
-        checkpoint: its name; None: the best.
+        run: with its checkpoint.
         protocol: of the race.
         beside: the lap is one of those that began where this one did, if there are any.
         ordinary: whether to add the median of the other complete laps, of those from the same start if there are any.
@@ -40,7 +38,7 @@ def laps_to_replay(
         BadInput: the checkpoint, a track or a condition cannot be used, or there is no other complete lap.
         RunFailed: a car's state became NaN.
     """
-    stored, evaluator, recorder, evaluation = _raced(run, checkpoint, protocol)
+    stored, evaluator, recorder, evaluation = _raced(run, protocol)
     starts = np.array([trial.start_ndist for trial in evaluator.trials])
     same = np.ones(len(starts), bool) if beside is None else is_same_start(starts, beside)
     best = best_attempt(evaluation, {*np.flatnonzero(same if same.any() else ~same).tolist()})
@@ -60,20 +58,16 @@ def laps_to_replay(
     ]
 
 
-def commands_of_run(run: StoredRun, checkpoint: str | None) -> Commands:
+def commands_of_run(run: StoredRun) -> Commands:
     """Race a run's checkpoint as its training evaluates it, on the usual conditions; return its fast laps' commands.
 
     On several tracks the fast laps are those of each track.
-
-    Args:
-        run: trained.
-        checkpoint: its name; None: the best.
 
     Raises:
         BadInput: the checkpoint cannot be used, or completes no lap without a reset.
         RunFailed: a car's state became NaN.
     """
-    stored, _, recorder, evaluation = _raced(run, checkpoint, run.experiment.evaluation)
+    stored, _, recorder, evaluation = _raced(run, run.experiment.evaluation)
     words: list[str] = []
     steps: list[NDArray[np.float64]] = []
     for group in evaluation.groups:
@@ -101,10 +95,10 @@ def commands_of_run(run: StoredRun, checkpoint: str | None) -> Commands:
 
 
 def _raced(
-    run: StoredRun, checkpoint: str | None, protocol: EvaluationConfig
+    run: StoredRun, protocol: EvaluationConfig
 ) -> tuple[StoredPolicy, Evaluator, LapRecorder, Evaluation]:
     """Race a checkpoint on the usual conditions and record every step."""
-    stored = read_checkpoint(run.experiment, run.checkpoints, run.choose_checkpoint(checkpoint))
+    stored = run.read_policy()
     torch.set_num_threads(1)
     evaluator = Evaluator(run.experiment, replace(protocol, held_out=None))
     recorder = LapRecorder(evaluator)

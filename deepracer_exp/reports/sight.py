@@ -24,7 +24,6 @@ from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.film import Lap, drive_best_lap, png
 from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.reports.page import Glimpse, png_uri
-from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import read_config
 
 SPACING, SPREAD = 12, 18
@@ -155,11 +154,11 @@ def run_glimpses(view: LogView, folder: Path, just_trained: bool = False) -> tup
     """
     if not just_trained and named_again(read_config(folder), OF_POLICY):
         return view, []
-    run = StoredRun(folder)
     try:
+        run = StoredRun(folder).with_checkpoint()
         experiment = run.experiment
         assert experiment.observation.camera is not None
-        policy = read_checkpoint(experiment, run.checkpoints, run.choose_checkpoint(None)).networks.policy
+        policy = run.read_policy().networks.policy
         evaluator = Evaluator(experiment, replace(experiment.evaluation, trials=1, laps=1, held_out=None))
         lap, acted = drive_best_lap(evaluator, policy)
     except (BadInput, RunFailed) as error:

@@ -17,14 +17,13 @@ from torch import nn
 from deepracer_exp.analysis.charts.run_pictures import SPEED
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.driving import CameraConfig, LidarConfig, ObservationConfig
-from deepracer_exp.config.evaluation import EvaluateConfig
+from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.env.action_space import ActionSpace, DiscreteActions
 from deepracer_exp.env.lidar import reach_of_rays
 from deepracer_exp.errors import RunFailed, count, writing
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.film import Lap, drive_best_lap, in_frames, write_film
 from deepracer_exp.lookup.resolve import StoredRun
-from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import FILMS
 from deepracer_exp.sim.lidar import ANGLES_RAD, MOUNT_X_M
 from deepracer_exp.tracks.picture import draw_track, extent
@@ -261,7 +260,9 @@ class _Distribution:
         return image
 
 
-def film_run(run: StoredRun, config: EvaluateConfig, file: Path | None, out: Console, err: Console) -> None:
+def film_run(
+    run: StoredRun, protocol: EvaluationConfig, file: Path | None, out: Console, err: Console
+) -> None:
     """Race a run's checkpoint under a protocol and film its fastest lap on the usual conditions.
 
     `file` is the .mp4 to write; None: named after the checkpoint, in the run's folder.
@@ -270,9 +271,9 @@ def film_run(run: StoredRun, config: EvaluateConfig, file: Path | None, out: Con
         BadInput: the checkpoint, a track or a condition cannot be used.
         RunFailed: a car's state became NaN, or the file cannot be written.
     """
-    stored = read_checkpoint(run.experiment, run.checkpoints, run.choose_checkpoint(config.checkpoint))
+    stored = run.read_policy()
     torch.set_num_threads(1)
-    evaluator = Evaluator(run.experiment, replace(config.evaluation, held_out=None))
+    evaluator = Evaluator(run.experiment, replace(protocol, held_out=None))
     err.print(
         f"{run.path.name}, checkpoint {stored.path.name}: {count(len(evaluator.trials), 'trial')}",
         highlight=False,

@@ -18,7 +18,6 @@ from optuna.trial import FrozenTrial
 from rich.console import Console
 
 from deepracer_exp.config import acting
-from deepracer_exp.config.compose import Composition, compose_experiment
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.overrides import group_of, key_of
@@ -28,21 +27,21 @@ from deepracer_exp.env.real_car import require_car
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.evaluation.evaluator import Evaluator, OnStep
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, TrialGroup
-from deepracer_exp.lookup.resolve import resolve
+from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.rewards.reward import RewardFunction
-from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.tracking.store import Store, resolve_store
 from deepracer_exp.tracking.study_run import Progress, StudyRun
 from deepracer_exp.tracking.tracking_file import Status
 from deepracer_exp.training.signals import Interruption
 
+from .plan import SweepPlan
 from .queue.claims import Claim, TrialClaims, report_results
 from .queue.driver import Driver
 from .queue.launcher import LocalLauncher
-from .queue.parent import Parent
+from .queue.parent import Parent, plan_trial
 from .queue.ray_launcher import RayLauncher
 from .queue.storage import open_storage, patiently, resolve_database
-from .queue.study import load_request, open_study
+from .queue.study import open_study
 from .queue.worker import Interrupted
 from .queue.worker_config import WorkerConfig
 from .report.best import (
@@ -75,7 +74,7 @@ _RESAMPLES = 2000
 _CONFIDENCE = 0.95
 
 
-def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]:
+def sweep(plan: SweepPlan, console: Console) -> tuple[Study, Path, int]:
     """Make the missing trials of a study; return it, the folder of its runs, and the exit code.
 
     Raises:
@@ -83,22 +82,22 @@ def sweep(overrides: Sequence[str], console: Console) -> tuple[Study, Path, int]
         RunFailed: all trials fail, workers keep dying, or the database does not answer.
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    overrides, request, known = load_request(overrides)
-    runs_dir, protocol = request.runs_dir, request.protocol
-    config = request.entry.sweep
-    request = _without_rules(request, overrides)
-    parent = _parent(request, known)
-    compose = partial(_composed, request, parent)
-    space = SearchSpace.from_request(request, (lambda lines: compose(lines)[1].mapping) if parent else None)
+    overrides, request = plan.overrides, _without_rules(plan.request, plan.overrides)
+    runs_dir, protocol, config = request.runs_dir, request.protocol, request.entry.sweep
+    parent = _parent(request, plan.study)
+    plan_one = partial(plan_trial, parent=parent, stored=request.stored)
+    check = (lambda lines: plan_one(lines).composition.mapping) if parent else None
+    space = SearchSpace.from_request(request, check)
     build_sampler(config, space)
     build_pruner(config)
-    experiment, composition = compose(space.example())
-    for note in (*request.composition.notes, *composition.notes) if request.stored else ():
+    example = plan_one(space.example())
+    experiment = example.experiment
+    for note in (*request.composition.notes, *example.composition.notes) if request.stored else ():
         _log.warning(note)
     if parent and protocol.real_car is not None:
         require_car(experiment)
     if not parent:
-        setup = build_setup(experiment)
+        setup = build_setup(experiment, files=example.files)
         RewardFunction(setup.reward, 1, setup.reward_time_limit_s, None)
     tracking = experiment.tracking
     store = resolve_store(tracking.uri, runs_dir) if isinstance(tracking, MLflowTracking) else None
@@ -275,16 +274,6 @@ def _parent(request: SweepRequest, known: Study | None) -> Parent | None:
     return Parent.find(run, request.study, request.runs_dir)
 
 
-def _composed(
-    request: SweepRequest, parent: Parent | None, overrides: list[str]
-) -> tuple[Experiment, Composition]:
-    """Return the experiment of a trial with these overrides, of a clone if trials have a parent."""
-    if parent is None:
-        return compose_experiment(overrides, stored=request.stored)
-    clone = parent.clone([*overrides, f"name={request.study}"], request.runs_dir, stored=request.stored)
-    return clone.experiment, clone.composition
-
-
 def _evaluations(experiment: Experiment, request: SweepRequest) -> int | None:
     """Return how often a trial is evaluated before its end, None if unknown or different between trials."""
     if {key.partition(".")[0] for key in request.space} & {"budget", "checkpoints", "experiment"} or any(
@@ -383,9 +372,8 @@ def _resampled(
 
 
 def _driven(run_dir: Path, protocol: EvaluationConfig, on_step: OnStep) -> Evaluation:
-    run = resolve(str(run_dir), run_dir.parent, None)
-    stored = read_checkpoint(run.experiment, run.checkpoints, run.choose_checkpoint(None))
-    return Evaluator(run.experiment, protocol)(stored.networks.policy, on_step)
+    run = StoredRun(run_dir).with_checkpoint()
+    return Evaluator(run.experiment, protocol)(run.read_policy().networks.policy, on_step)
 
 
 def _reranked(

@@ -331,6 +331,12 @@ def _naming(source: object) -> Iterator[None]:
         raise BadInput(source, error) from None
 
 
+def directed_tracks(config: TrackConfig) -> tuple[Track, ...]:
+    """Build a track in each direction in which it is driven, the one of the first episode first."""
+    directions = {"forward": (False,), "reversed": (True,), "alternate": (False, True)}[config.direction]
+    return tuple(Track.from_config(config, backwards) for backwards in directions)
+
+
 def _frozen(array: np.ndarray) -> np.ndarray:
     array = np.array(array, order="C")
     array.flags.writeable = False

@@ -1,20 +1,16 @@
 """A run that begins with another run's policy."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from deepracer_exp.agents.actor_critic import ActorCritic
 from deepracer_exp.config import acting
 from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.overrides import group_of, key_of
-from deepracer_exp.config.parse import parse_experiment
+from deepracer_exp.config.parse import import_own_classes, parse_experiment
 from deepracer_exp.config.stored import with_overrides
-from deepracer_exp.lookup.resolve import StoredRun, resolve
+from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pin
-from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import (
     CHECKPOINTS,
     PROVENANCE,
@@ -26,9 +22,13 @@ from deepracer_exp.runs.files import (
 )
 from deepracer_exp.runs.lineage import Lineage, read_lineage, refuse_other_networks
 
+from .plan import TrainPlan, plan_training
+
+if TYPE_CHECKING:
+    from deepracer_exp.agents.actor_critic import ActorCritic
+
 SLOWER = 0.1
 """A clone's learning rate over its parent's, where none is given: what racers do with a good model."""
-_OWN = ("run", "checkpoint")
 _AS_USUAL = ("report=true", "collector.mode=sync", "collector.processes=null", "collector.threads=0")
 """Settings for the clone of a sweep's trial, which had one core and no report, because others ran beside it."""
 _ALLOWED = {
@@ -38,59 +38,58 @@ _ALLOWED = {
 }
 
 
-@dataclass(frozen=True)
-class Clone:
-    """Everything that a clone is trained with."""
-
-    experiment: Experiment
-    composition: Composition
-    start: tuple[ActorCritic, Lineage]
-    """The networks to begin with, and whose they were."""
-    notes: tuple[str, ...]
-    """Notes for the user, a line each."""
-
-
-def prepare_clone(
-    overrides: Sequence[str], runs_dir: Path, tracking_uri: str | None, *, stored: bool = False
-) -> Clone:
-    """Read the parent and its checkpoint, and change its configuration; the checkpoint is pinned.
+def plan_clone(parent: StoredRun, changes: Sequence[str], *, stored: bool = False) -> TrainPlan:
+    """Change the configuration of a run and read its files.
 
     Args:
-        overrides: `run=` (required), perhaps `checkpoint=`, and what differs from the parent.
-        runs_dir: where the parent is.
-        tracking_uri: where ids and aliases are looked up; None: in `runs_dir`.
+        parent: the run, with the checkpoint to begin with.
+        changes: what differs from the parent, as overrides.
         stored: whether a study holds the overrides; the user's own words otherwise.
 
     Raises:
-        BadInput: the parent or its checkpoint cannot be used, what the overrides ask for does not fit its networks, or
-            its reward function is not the user's own.
+        BadInput: what the overrides ask for is not accepted or does not fit the parent's networks, or the reward
+            function or a class is not the user's own.
     """
-    options = dict(override.split("=", 1) for override in overrides if override.split("=", 1)[0] in _OWN)
-    changes = [override for override in overrides if override.split("=", 1)[0] not in _OWN]
-    parent = resolve(options["run"], runs_dir, tracking_uri)
-    name = parent.choose_checkpoint(options.get("checkpoint"))
-    checkpoint = read_checkpoint(parent.experiment, parent.checkpoints, name)
     composition = _changed(parent, changes, stored)
     experiment = parse_experiment(composition.mapping)
+    import_own_classes(experiment)
     acting.refuse_reward(experiment.reward.file, parent.path.name, parent.path / REWARD)
+    plan = plan_training(experiment, composition, parent)
     refuse_other_networks(parent.experiment, experiment)
-    above = read_lineage(parent.path)
-    lineage = Lineage(
+    return plan
+
+
+def read_parent(parent: StoredRun, clone: Experiment) -> "tuple[ActorCritic, Lineage]":
+    """Read the networks that a clone begins with, and whose they were; their checkpoint is pinned.
+
+    Raises:
+        BadInput: the checkpoint cannot be used.
+    """
+    checkpoint, above = parent.read_policy(), read_lineage(parent.path)
+    name = checkpoint.path.name
+    pin(parent.path / CHECKPOINTS, name, f"cloned into {clone.name}")
+    return checkpoint.networks, Lineage(
         parent=parent.path.name,
         parent_dir=str(parent.path.resolve()),
         parent_run_id=read_run_id(parent.path),
-        checkpoint=checkpoint.path.name,
+        checkpoint=name,
         sha256=checkpoint_sha256(checkpoint.path),
         generation=1 + (above.generation if above else 0),
         registered=parent.registered,
     )
-    pin(parent.path / CHECKPOINTS, checkpoint.path.name, f"cloned into {experiment.name}")
-    return Clone(
-        experiment,
-        composition,
-        (checkpoint.networks, lineage),
-        (*_notes(parent, experiment, checkpoint.path.name), *composition.notes),
-    )
+
+
+def describe_clone(parent: StoredRun, clone: Experiment, lineage: Lineage) -> list[str]:
+    """Return what a clone has of its parent, and warnings of what it has not, a line each."""
+    before: dict[str, Any] = vars(parent.experiment)
+    notes = [
+        f"clone of {parent.path.name}, checkpoint {lineage.checkpoint}; learning rate {clone.algorithm.lr:g} "
+        f"(the parent's: {parent.experiment.algorithm.lr:g})"
+    ]
+    for group, why in _ALLOWED.items():
+        if vars(clone)[group] != before[group]:
+            notes.append(f"warning: {group} is not the parent's: {why}")
+    return notes
 
 
 def _changed(parent: StoredRun, changes: Sequence[str], stored: bool) -> Composition:
@@ -108,15 +107,3 @@ def _changed(parent: StoredRun, changes: Sequence[str], stored: bool) -> Composi
         composition.mapping["teacher"] = None
         composition.mapping["algorithm"]["teacher_iterations"] = 0
     return composition
-
-
-def _notes(parent: StoredRun, clone: Experiment, checkpoint: str) -> list[str]:
-    before: dict[str, Any] = vars(parent.experiment)
-    notes = [
-        f"clone of {parent.path.name}, checkpoint {checkpoint}; learning rate {clone.algorithm.lr:g} "
-        f"(the parent's: {parent.experiment.algorithm.lr:g})"
-    ]
-    for group, why in _ALLOWED.items():
-        if vars(clone)[group] != before[group]:
-            notes.append(f"warning: {group} is not the parent's: {why}")
-    return notes

@@ -33,6 +33,7 @@ from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.source import load_reward_source
 
+from .plan import plan_training
 from .run import store_run
 
 _CHECKPOINT = "checkpoint="
@@ -98,7 +99,7 @@ def _import(model: StoredModel, path: str, aside: str, name: str, changes: Seque
     several, applied = several_of(job), [*car_override(files, by_key)[1], *of_job]
     try:
         experiment, composition = compose_experiment([f"experiment={name}", *several, *changes])
-        result = store_run(experiment, composition, networks, f"imported from {model.source}")
+        result = store_run(plan_training(experiment, composition), networks, f"imported from {model.source}")
     except BaseException:
         remove_options(options)
         raise

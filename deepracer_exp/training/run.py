@@ -24,9 +24,6 @@ from deepracer_exp.config import acting
 from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.own_class import own_classes
-from deepracer_exp.config.parse import import_own_classes, parse_experiment
-from deepracer_exp.config.stored import with_overrides
-from deepracer_exp.env.action_space import action_remarks
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.errors import NO_MEMORY, BadInput, RunFailed, count, is_refused_memory, reading
 from deepracer_exp.rewards.reward import RewardFunction
@@ -36,11 +33,9 @@ from deepracer_exp.runs.files import (
     CONFIG,
     LINEAGE,
     METRICS,
-    PROVENANCE,
     REWARD,
     SUMMARY,
     TRACKING,
-    read_config,
     read_object,
 )
 from deepracer_exp.runs.fingerprint import refuse_changes
@@ -54,11 +49,13 @@ from deepracer_exp.tracking.metadata import joined, lineage_tags, run_params, ru
 from deepracer_exp.tracking.metrics import now_ms
 from deepracer_exp.tracking.tracking_file import TrackedRun, begin_again, read_tracked_run
 
-from .budget import refuse_ended, refuse_spent
+from .budget import refuse_spent
 from .callbacks import standard_callbacks
+from .clone import describe_clone, read_parent
 from .metrics import track_names
+from .plan import ResumePlan, TrainPlan
 from .signals import Interruption
-from .teacher import find_teacher, keep_teacher
+from .teacher import check_teacher, keep_teacher
 from .trainer import Callback, TakenOver, Trainer, TrainResult
 
 logger = logging.getLogger("deepracer_exp")
@@ -69,22 +66,18 @@ Measured: 7.1 with collector=in_process, 7.8 with sync."""
 
 
 def run_training(
-    experiment: Experiment,
-    composition: Composition,
+    plan: TrainPlan,
     console: Console | None = None,
-    start: tuple[ActorCritic, Lineage] | None = None,
     callbacks: Sequence[Callback] = (),
     run_name: str | None = None,
     tags: Mapping[str, str] = MappingProxyType({}),
     created: Callable[[Path], None] | None = None,
 ) -> TrainResult:
-    """Train an experiment.
+    """Train what was planned.
 
     Args:
-        experiment: validated.
-        composition: where it came from; `compose_experiment` returns both.
+        plan: of `plan_training` or `plan_clone`.
         console: shows the progress; None: nothing is shown.
-        start: networks to begin with, and whose they were; None: new ones.
         callbacks: called beside the standard ones, see `standard_callbacks`.
         run_name: of the run in MLflow; None: from the reward function and the time.
         tags: of the run in MLflow, beside its own.
@@ -100,16 +93,19 @@ def run_training(
     console = console or Console(quiet=True)
     # Signals are caught from here on, so that Ctrl-C during the start leaves a whole folder, too.
     with Interruption(_printing(console)) as interruption:
-        setup = read_files(experiment)
-        memory = memory_of_pictures(experiment)
-        trainer = _begin(experiment, composition, setup, console, start, callbacks, run_name, tags, created)
+        start = None
+        if plan.parent is not None:
+            start = read_parent(plan.parent, plan.experiment)
+            for note in describe_clone(plan.parent, plan.experiment, start[1]):
+                _printing(console)(note)
+        setup = try_out(plan)
+        memory = memory_of_pictures(plan.experiment)
+        trainer = _begin(plan, setup, console, start, callbacks, run_name, tags, created)
         _print_memory(memory, console)
         return _run(trainer, interruption)
 
 
-def store_run(
-    experiment: Experiment, composition: Composition, networks: ActorCritic, reason: str
-) -> TrainResult:
+def store_run(plan: TrainPlan, networks: ActorCritic, reason: str) -> TrainResult:
     """Make a run of networks that were trained elsewhere, as if its training had ended before it began.
 
     The reward function is not run. `networks` are its checkpoint, best and last; `reason` says in the summary where
@@ -118,14 +114,13 @@ def store_run(
     Raises:
         BadInput: as for `run_training`; no folder is left.
     """
-    setup = build_setup(experiment)
-    trainer = _begin(experiment, composition, setup, Console(quiet=True), (networks, None))
+    setup = build_setup(plan.experiment, files=plan.files)
+    trainer = _begin(plan, setup, Console(quiet=True), (networks, None))
     return trainer.end(Ending(FINISHED, reason), 0)
 
 
 def resume_training(
-    run_dir: Path,
-    overrides: Sequence[str],
+    plan: ResumePlan,
     console: Console | None = None,
     callbacks: Sequence[Callback] = (),
     run_name: str | None = None,
@@ -133,16 +128,15 @@ def resume_training(
 ) -> TrainResult:
     """Resume a run that was killed, interrupted or failed from its last checkpoint.
 
-    `overrides` are of values that change nothing of what it learns; the others as of `run_training`.
+    Args as for `run_training`; the plan is of `plan_resume`, and changes nothing of what the run learns.
 
     Raises:
-        RunEnded: the run has ended.
         BadInput: it is being trained, or was started with other values.
         TakenOver: a callback raised it.
     """
     console = console or Console(quiet=True)
     with Interruption(_printing(console)) as interruption:
-        return _run(_reopen(run_dir, overrides, console, callbacks, run_name, tags), interruption)
+        return _run(_reopen(plan, console, callbacks, run_name, tags), interruption)
 
 
 def copy_run(run_dir: Path, attempt: int) -> Path:
@@ -165,14 +159,14 @@ def copy_run(run_dir: Path, attempt: int) -> Path:
     return target
 
 
-def read_files(experiment: Experiment) -> RaceSetup:
-    """Read the files an experiment names and run the reward function's module once.
+def try_out(plan: TrainPlan) -> RaceSetup:
+    """Build the race of a plan and run the reward function's module once.
 
     Raises:
-        BadInput: a file is missing or malformed, or values contradict.
+        BadInput: one of them cannot be used, or values contradict.
     """
-    setup = build_setup(experiment)
-    _try(experiment, setup)
+    setup = build_setup(plan.experiment, files=plan.files)
+    _try(plan.experiment, setup)
     return setup
 
 
@@ -220,8 +214,7 @@ def memory_of_pictures(experiment: Experiment) -> str | None:
 
 
 def _begin(
-    experiment: Experiment,
-    composition: Composition,
+    plan: TrainPlan,
     setup: RaceSetup,
     console: Console,
     start: tuple[ActorCritic, Lineage | None] | None,
@@ -231,8 +224,10 @@ def _begin(
     created: Callable[[Path], None] | None = None,
 ) -> Trainer:
     """Create the folder of a new run and record it."""
+    experiment, composition, teacher = plan.experiment, plan.composition, None
     refuse_spent(experiment.budget, Path(experiment.runs_dir) / experiment.name)
-    teacher = find_teacher(experiment)
+    if plan.teacher is not None:
+        teacher = check_teacher(plan.teacher, experiment)
     tracker = open_tracker(experiment.tracking, Path(experiment.runs_dir))
     names = _names(composition, joined(track_names(setup)), setup.reward.name)
     every = standard_callbacks(experiment, setup, names, tracker, console, callbacks)
@@ -265,7 +260,7 @@ def _begin(
             raise BadInput(reason) from error
         raise
     acting.remember()
-    for note in (*composition.notes, *action_remarks(setup.actions, experiment.car)):
+    for note in (*composition.notes, *plan.files.remarks):
         logger.info(note)
     if teacher is not None:
         logger.info("teacher: %s, checkpoint %s", teacher.path, teacher.checkpoint)
@@ -299,23 +294,15 @@ def _described(
 
 
 def _reopen(
-    run_dir: Path,
-    overrides: Sequence[str],
+    plan: ResumePlan,
     console: Console,
     callbacks: Sequence[Callback],
     run_name: str | None,
     tags: Mapping[str, str],
 ) -> Trainer:
     """Return a run to its last checkpoint."""
-    stored = read_config(run_dir)
-    provenance = read_object(run_dir / PROVENANCE)
-    names = provenance.get("names", {})
-    composition = with_overrides(stored, names, overrides)
-    # The folder may have been moved, together with all runs.
-    composition.mapping["runs_dir"] = str(run_dir.parent.parent)
-    experiment = parse_experiment(composition.mapping)
-    refuse_ended(run_dir, experiment.budget, overrides)
-    import_own_classes(experiment)
+    run_dir, experiment, composition = plan.run_dir, plan.experiment, plan.composition
+    names = plan.provenance.get("names", {})
     setup = build_setup(experiment)
     memory = memory_of_pictures(experiment)
     checkpoint = intact_checkpoint(run_dir / CHECKPOINTS, "last", resumable=True)
@@ -329,7 +316,7 @@ def _reopen(
     folder = RunFolder(run_dir)
     iteration = state["iteration"]
     try:
-        trainer = Trainer(experiment, setup, folder, stored, every)
+        trainer = Trainer(experiment, setup, folder, plan.stored, every)
         rows = [row for row in folder.metrics() if row["iteration"] <= iteration]
         if len(rows) != iteration:
             raise BadInput(
@@ -340,7 +327,7 @@ def _reopen(
         if (folder.path / TRACKING).exists():
             recorded = read_tracked_run(folder.path / TRACKING)
         else:  # killed before it was recorded, or trained with tracking=off
-            commit = provenance.get("git_commit")
+            commit = plan.provenance.get("git_commit")
             recorded = _described(trainer, composition, names, commit, run_name, tags)
         tracker.open(folder.path, recorded)
     except BadInput:

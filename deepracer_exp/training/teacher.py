@@ -9,22 +9,19 @@ from tensordict.nn import TensorDictModuleBase
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.action_space import build_action_space, describe_actions
 from deepracer_exp.errors import BadInput
-from deepracer_exp.lookup.resolve import StoredRun, resolve
-from deepracer_exp.runs.checkpoints import check, read_checkpoint, read_policy
+from deepracer_exp.lookup.resolve import StoredRun
+from deepracer_exp.runs.checkpoints import check, read_policy
 from deepracer_exp.runs.files import CHECKPOINTS, CONFIG, TEACHER
 
 
-def find_teacher(experiment: Experiment) -> StoredRun | None:
-    """Return the run that an experiment's policy learns from, with the name of its checkpoint; None: there is none.
+def check_teacher(run: StoredRun, experiment: Experiment) -> StoredRun:
+    """Return the run that an experiment's policy learns from, with the name of the checkpoint that was read.
 
     Raises:
-        BadInput: there is no such run or checkpoint, its policy has other actions, or it sees what the cars of this
-            experiment do not.
+        BadInput: the checkpoint is corrupt, its policy has other actions, or it sees what the cars of this experiment
+            do not.
     """
-    if experiment.teacher is None:
-        return None
-    run = resolve(experiment.teacher, Path(experiment.runs_dir), getattr(experiment.tracking, "uri", None))
-    stored = read_checkpoint(run.experiment, run.checkpoints, run.choose_checkpoint(None))
+    stored = run.read_policy()
     what = f"teacher={experiment.teacher}"
     theirs, ours = (
         describe_actions(build_action_space(side.action_space)) for side in (run.experiment, experiment)

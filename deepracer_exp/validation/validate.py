@@ -17,13 +17,14 @@ from rich.table import Table
 
 from deepracer_exp.aws.worlds.catalogue import UNITS_PER_M
 from deepracer_exp.aws.worlds.routes import recognise
-from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.env.files import RaceFiles
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.errors import BadInput, RunFailed, count, writing
 from deepracer_exp.rewards.reward import RewardFailed
 from deepracer_exp.runs.files import METRICS, read_metrics
 from deepracer_exp.tracks.track import Track
+from deepracer_exp.training.plan import TrainPlan
 
 from . import pitfalls
 from .aws_dry_run import dry_run_findings
@@ -51,14 +52,14 @@ _SLOW_S = 1e-3
 
 
 def validate_reward(
-    experiment: Experiment,
-    trial: tuple[Experiment, Composition] | None,
+    plan: TrainPlan,
+    trial: TrainPlan | None,
     output: str | None,
     strict: bool,
     out: Console,
     err: Console,
 ) -> int:
-    """Validate the reward function of an experiment, print the findings, draw its map and try a short training.
+    """Validate the reward function of a plan, print the findings, draw its map and try a short training.
 
     Returns:
         The exit code: 0; 2 if the function cannot be used here, or, with `strict`, by AWS.
@@ -67,7 +68,7 @@ def validate_reward(
         BadInput: a file cannot be used or written; the function's module cannot be loaded.
         RunFailed: the short training failed.
     """
-    check = read(experiment)
+    check = read(plan.experiment, plan.files)
     setup = check.setup
     out.print(f"[bold]{escape(setup.reward.name)}[/bold] on {escape(setup.track.title)}\n", highlight=False)
     _print_aws(out, check.aws)
@@ -83,11 +84,11 @@ def validate_reward(
         look_closer(check)
     if not check.failures:
         _print_laps(out, check)
-        _draw(out, check, _default_picture(experiment, check) if output is None else Path(output))
+        _draw(out, check, _default_picture(plan.experiment, check) if output is None else Path(output))
     _print_lines(out, "Warnings", "yellow", check.warnings)
     _print_lines(out, "Failures", "red", check.failures)
     if trial is not None and not check.failures and not (strict and check.aws):
-        _train_shortly(out, err, *trial)
+        _train_shortly(out, err, trial)
     return _verdict(out, check, strict)
 
 
@@ -118,8 +119,8 @@ class Check:
     """None: not sampled, because a call takes too long."""
 
 
-def read(experiment: Experiment) -> Check:
-    """Read an experiment's files and find what AWS would refuse in its reward function.
+def read(experiment: Experiment, files: RaceFiles | None = None) -> Check:
+    """Read an experiment's files, unless they were read, and find what AWS would refuse in its reward function.
 
     Raises:
         BadInput: a file cannot be used; the reward is not valid Python or lacks a one-argument `reward_function`;
@@ -128,7 +129,7 @@ def read(experiment: Experiment) -> Check:
     if len(experiment.tracks) > 1:
         names = ", ".join(experiment.tracks)
         raise BadInput(f"track=[{names}]", "a reward function is validated on one track", "one of these")
-    setup = build_setup(experiment)
+    setup = build_setup(experiment, files=files)
     (track,) = experiment.tracks.values()
     # A track driven in both directions is checked in the first of them.
     return Check(
@@ -380,7 +381,7 @@ def _print_first(out: Console, lines: list[str]) -> None:
         _line(out, f"  and {len(lines) - _MOST} more")
 
 
-def _train_shortly(out: Console, err: Console, experiment: Experiment, composition: Composition) -> None:
+def _train_shortly(out: Console, err: Console, plan: TrainPlan) -> None:
     """Train and print whether anything improves.
 
     Raises:
@@ -390,7 +391,7 @@ def _train_shortly(out: Console, err: Console, experiment: Experiment, compositi
     """
     from deepracer_exp.training.run import run_training
 
-    outcome = run_training(experiment, composition, err)
+    outcome = run_training(plan, err)
     if outcome.status == "failed":
         raise RunFailed(f"trial: run failed: {outcome.reason}; see {outcome.folder}")
     if outcome.status == "interrupted":

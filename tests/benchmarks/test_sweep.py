@@ -148,7 +148,7 @@ def test_a_whole_run_reports_what_the_sweep_would_report_at_each_evaluation(
     trained: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = trained("budget.iterations=5", "budget.env_steps=null", "checkpoints.every=2").folder
-    config = compose_evaluation(["run=any", "evaluation=sweep"])[0].evaluation
+    config = compose_evaluation(["evaluation=sweep"])[0].evaluation
     monkeypatch.setattr(sweep_runs, "score", lambda *_: 12.5)
     found = sweep_runs.course_of(3, run, "completion", config)
     rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]

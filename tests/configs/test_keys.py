@@ -9,7 +9,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import pytest
 import yaml
 
-from deepracer_exp.config.evaluation import EvaluateConfig, ExportConfig
+from deepracer_exp.config.evaluation import EvaluateConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.options import conf_dir, groups
 from deepracer_exp.config.own_class import OwnClass
@@ -65,7 +65,7 @@ def test_every_key_of_a_file_has_a_comment_above_it(path):
 
 
 def test_the_keys_that_are_explained_are_the_fields_of_the_dataclasses():
-    entries = (Experiment, EvaluateConfig, ExportConfig, SweepEntry)
+    entries = (Experiment, EvaluateConfig, SweepEntry)
     chosen = {group.replace("/", ".") for entry in conf_dir().glob("*.yaml") for group in groups(entry.stem)}
     named = {key for kind in entries for key in fields(kind)} - chosen
     explained = {key for path in FILES for key in keys_of(path)} - {"tracking"}

@@ -55,7 +55,7 @@ def protocol() -> Callable[..., EvaluationConfig]:
     """Compose a protocol; without held-out conditions unless they are asked for."""
 
     def build(name: str, **changes: object) -> EvaluationConfig:
-        config = compose_evaluation(["run=x", f"evaluation={name}"])[0].evaluation
+        config = compose_evaluation([f"evaluation={name}"])[0].evaluation
         return dataclasses.replace(config, **{"held_out": None, **changes})
 
     return build

@@ -24,7 +24,7 @@ class BrightSide(torch.nn.Module):
 
 @pytest.fixture(scope="module")
 def config():
-    lines = ["run=x", "evaluation=real_car", "evaluation.trials=1", "evaluation.time_s=1"]
+    lines = ["evaluation=real_car", "evaluation.trials=1", "evaluation.time_s=1"]
     return compose_evaluation(lines)[0].evaluation
 
 

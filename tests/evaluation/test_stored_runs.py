@@ -126,11 +126,11 @@ def test_bad_input_is_one_line(call, arguments, words):
     call(*arguments).assert_refused(*words)
 
 
-def test_a_video_needs_a_library_to_draw_with(call, monkeypatch):
+def test_a_video_needs_a_library_to_draw_with(run_dir, call, monkeypatch):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setattr("ctypes.util.find_library", lambda name: None)
     monkeypatch.setattr("sys.platform", "linux")
-    call("evaluate", "x", "--video", "lap.mp4").assert_refused("EGL nor OSMesa")
+    call("evaluate", str(run_dir), "--video", "lap.mp4").assert_refused("EGL nor OSMesa")
 
 
 @pytest.mark.parametrize(

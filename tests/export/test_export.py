@@ -42,8 +42,14 @@ def test_what_the_console_would_refuse_of_a_reward_is_reported(trained, call, tm
             "sees with the camera, format=car",
         ),
         (["nowhere", "format=onnx"], "nowhere: no such run"),
-        (["nowhere", "format=coreml"], 'format="coreml"'),
-        (["nowhere", "format=onnx", "chekpoint=last"], "chekpoint: no such key (did you mean checkpoint?)"),
+        (
+            ["nowhere", "format=coreml"],
+            "format=coreml: no such format; accepted: onnx, car, aws, aws-model, aws-logs",
+        ),
+        (
+            ["nowhere", "format=onnx", "chekpoint=last"],
+            "chekpoint=last: no such key (did you mean checkpoint?)",
+        ),
     ],
 )
 def test_what_cannot_be_exported_is_refused_in_one_line(call, arguments, words):

@@ -16,8 +16,14 @@ from deepracer_exp.evaluation.video import can_draw
 print(can_draw())
 """
 FILM = """
+from pathlib import Path
 from deepracer_exp.cli import main
-main(["evaluate", "x", "--video", "lap.mp4"])
+from deepracer_exp.config.compose import compose_experiment
+run = Path("runs/a/x")
+(run / "checkpoints" / "000001").mkdir(parents=True)
+(run / "checkpoints" / "last").symlink_to("000001")
+(run / "config.yaml").write_text(compose_experiment([])[1].yaml())
+main(["evaluate", str(run), "--video", "lap.mp4"])
 """
 
 # What takes seconds to import is imported once, and a process forked for each call. MuJoCo is not among it: it reads

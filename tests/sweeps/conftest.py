@@ -10,7 +10,7 @@ import optuna
 import pytest
 import sqlalchemy as sa
 
-from deepracer_exp.commands.startup import start_workers_early
+from deepracer_exp.collectors.forking import start_workers_early
 from deepracer_exp.sweeps.queue.claims import TrialClaims
 from deepracer_exp.sweeps.queue.storage import resolve_database
 from tests.waiting import PATIENCE_S

@@ -107,7 +107,7 @@ def test_ctrl_c_ends_the_re_ranking_between_two_trials(tmp_path):
     study = new_study(tmp_path)
     add(study, [9.0])
     config = SimpleNamespace(rerank=1, rerank_laps=60, objectives=("race_score",))
-    protocol = compose_evaluation(["run=any", "evaluation=sweep"])[0].evaluation
+    protocol = compose_evaluation(["evaluation=sweep"])[0].evaluation
     worker_config = SimpleNamespace(config=config, protocol=protocol, folder=tmp_path, runs_dir=tmp_path)
     interruption = Interruption()
     interruption.signum = signal.SIGINT

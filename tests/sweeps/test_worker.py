@@ -38,7 +38,7 @@ def worker(tmp_path, *asked: str) -> tuple[Worker, RDBStorage]:
         study="s",
         runs_dir=tmp_path,
         config=request.entry.sweep,
-        protocol=compose_evaluation(["run=any", "evaluation=sweep"])[0].evaluation,
+        protocol=compose_evaluation(["evaluation=sweep"])[0].evaluation,
         space=space,
         parent=None,
         store=None,

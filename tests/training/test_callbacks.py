@@ -8,6 +8,7 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.runs.files import read_metrics
 from deepracer_exp.runs.folder import RunFolder, is_held
 from deepracer_exp.runs.result import STOPPED_EARLY
+from deepracer_exp.training.plan import plan_resume, plan_training
 from deepracer_exp.training.run import copy_run, resume_training, run_training
 from deepracer_exp.training.trainer import Callback, TakenOver
 
@@ -35,8 +36,8 @@ def take_away(trainer):
 
 
 def run(folder, callback, *overrides, **options):
-    experiment, composition = compose_experiment([*TINY, f"runs_dir={folder}", *overrides])
-    return run_training(experiment, composition, callbacks=[callback] if callback else (), **options)
+    plan = plan_training(*compose_experiment([*TINY, f"runs_dir={folder}", *overrides]))
+    return run_training(plan, callbacks=[callback] if callback else (), **options)
 
 
 def test_a_run_that_a_callback_stops_early_keeps_a_best_policy(tmp_path):
@@ -65,7 +66,7 @@ def test_a_copy_continues_as_the_run_would_have_while_its_folder_is_held(tmp_pat
     assert is_held(callback.dir)
     copy = copy_run(callback.dir, 2)
     assert copy.name == f"{callback.dir.name}-attempt2"
-    outcome = resume_training(copy, [])
+    outcome = resume_training(plan_resume(copy, []))
     assert outcome.status == "finished"
     whole = run(tmp_path / "whole", None).folder
     assert_same_run(whole, copy)

@@ -10,10 +10,11 @@ import yaml
 from mlflow import MlflowClient
 from torchrl.checkpoint import Checkpoint
 
+from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pinned
 from deepracer_exp.runs.checkpoints import State
 from deepracer_exp.runs.files import read_config, read_object
-from deepracer_exp.training.clone import prepare_clone
+from deepracer_exp.training.clone import plan_clone
 
 OFTEN = ("episode.max_steps=60", "checkpoints.every=2", "budget.env_steps=null", "budget.iterations=3")
 
@@ -62,7 +63,7 @@ def test_a_clone_begins_with_the_parents_best_policy_and_learns_at_a_tenth_of_it
 
 def test_a_clone_of_a_sweeps_trial_runs_as_a_training_does(parent):
     def clone(*changes):
-        return prepare_clone([f"run={parent}", *changes], parent.parents[1], None).experiment
+        return plan_clone(StoredRun(parent).with_checkpoint(), changes).experiment
 
     stored = read_config(parent)
     assert (stored["report"], stored["collector"]["mode"]) == (False, "in_process")

@@ -13,6 +13,7 @@ from deepracer_exp.env.observation import Features
 from deepracer_exp.runs.files import read_metrics
 from deepracer_exp.runs.result import Ending
 from deepracer_exp.runs.trace import read_trace
+from deepracer_exp.training.plan import plan_training
 from deepracer_exp.training.run import run_training
 
 from .conftest import assert_same_run
@@ -211,8 +212,11 @@ def test_a_bug_of_ours_shows_its_traceback_and_the_run_counts_as_failed(tmp_path
         raise ZeroDivisionError("of ours")
 
     monkeypatch.setattr(PPO, "update", broken)
+    plan = plan_training(
+        *compose_experiment(["experiment=tiny", "tracking=off", f"runs_dir='{tmp_path}'", HERE])
+    )
     with pytest.raises(ZeroDivisionError, match="of ours"):
-        run_training(*compose_experiment(["experiment=tiny", "tracking=off", f"runs_dir='{tmp_path}'", HERE]))
+        run_training(plan)
     (summary,) = tmp_path.glob("tiny/*/summary.json")
     assert json.loads(summary.read_text())["status"] == "failed"
     assert "Traceback" in summary.with_name("log.txt").read_text()

@@ -67,31 +67,31 @@ def _names_only(overrides: Sequence[str]) -> bool:
     return not {override.partition("=")[0].strip().lstrip("+~") for override in overrides} - {*MAY_DIFFER}
 
 
-def load_request(overrides: Sequence[str]) -> tuple[list[str], SweepRequest, Study | None]:
+def with_stored(
+    request: SweepRequest, overrides: Sequence[str]
+) -> tuple[Sequence[str], SweepRequest, Study | None]:
     """Return the overrides of a sweep, the request they make, and its study if that exists.
 
-    Overrides that only name a study are preceded by those that the study was begun with.
+    Overrides that only name a study are preceded by those that the study was begun with, and composed with them.
 
     Raises:
         BadInput: an override is not accepted, there is nothing to search, or there is no study of that name to resume.
     """
-    request = compose_sweep(overrides)
     names_only = _names_only(overrides)
     known = _known(request, names_only)
     if known is None:
-        return list(overrides), request, None
-    whole = list(overrides)
+        return overrides, request, None
     if names_only:
         # The total of the last start: it may have been raised since the study was begun.
         total = [f"sweep.trials={known.user_attrs['trials']}"] if "trials" in known.user_attrs else []
-        whole = [*known.user_attrs.get("overrides", ()), *total, *overrides]
-    request = compose_sweep(whole, stored=names_only)
+        overrides = [*known.user_attrs.get("overrides", ()), *total, *overrides]
+        request = compose_sweep(overrides, stored=True)
     if not request.space:
         raise BadInput(
             f"study={request.study}: exists; to resume it, give only {', '.join(MAY_DIFFER)} beside its "
             "name; for anything else give the whole search again"
         )
-    return whole, request, known
+    return overrides, request, known
 
 
 def open_study(

@@ -12,17 +12,13 @@ import optuna
 from optuna.storages import BaseStorage, RDBStorage
 from optuna.trial import FrozenTrial
 
-from deepracer_exp.agents.actor_critic import ActorCritic
-from deepracer_exp.config.compose import Composition, compose_experiment
-from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.overrides import key_of
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.evaluation.evaluate import write_evaluation
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL
-from deepracer_exp.lookup.resolve import resolve
+from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.checkpoint_files import kept_checkpoints
-from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.files import (
     CHECKPOINTS,
     METRICS,
@@ -33,7 +29,6 @@ from deepracer_exp.runs.files import (
     read_run_id,
 )
 from deepracer_exp.runs.folder import is_held
-from deepracer_exp.runs.lineage import Lineage
 from deepracer_exp.runs.result import FAILED, FINISHED, INTERRUPTED, STOPPED_EARLY, Ending
 from deepracer_exp.sweeps.search.objectives import intermediate_value, objective_values
 from deepracer_exp.sweeps.search.pruners import FirstOf, PruneDecision, build_pruner, is_worse_across_seeds
@@ -44,16 +39,17 @@ from deepracer_exp.tracking.metrics import trial_metrics
 from deepracer_exp.tracking.study_run import TRIAL, end_trial_run, open_trial_run
 from deepracer_exp.tracking.tracking_file import Status
 from deepracer_exp.training.budget import RunEnded
+from deepracer_exp.training.plan import TrainPlan, plan_resume
 from deepracer_exp.training.run import copy_run, resume_training, run_training
 from deepracer_exp.training.signals import Interruption
 from deepracer_exp.training.trainer import Callback, TakenOver, Trainer, TrainResult
 
 from .claims import Claim, Lease, TrialClaims, report_results
+from .parent import plan_trial
 from .storage import patiently, resolve_database
 from .worker_config import WorkerConfig
 
 Value = TypeVar("Value")
-Start = tuple[ActorCritic, Lineage]
 
 _log = logging.getLogger("deepracer_exp")
 
@@ -281,8 +277,8 @@ class TrialRun(Callback):
         again = sum(trial.user_attrs.get("drawn") == drawn for trial in others)
         if not again:
             return drawn
-        experiment, _, _ = self._composed(drawn)
-        return [*drawn, f"seed={experiment.seed + again * self._config.config.seeds}"]
+        seed = self._planned(drawn).experiment.seed
+        return [*drawn, f"seed={seed + again * self._config.config.seeds}"]
 
     def _made(self, overrides: Sequence[str]) -> SeedRun:
         """Make the run of the present seed, and evaluate it."""
@@ -321,14 +317,15 @@ class TrialRun(Callback):
         if "collector.threads" not in given:
             where.append(f"collector.threads={self._config.cores}")
         own += where if "report" in given else [*where, "report=false"]
-        experiment, composition, start = self._composed(own)
+        plan = self._planned(own)
+        experiment = plan.experiment
         if experiment.observation.camera is not None:
             # Several threads update such networks, and the last digits depend on how many.
             self._patiently(lambda: self._trial.set_user_attr("where", where))
         if self._seed:
-            experiment, composition, start = self._composed([*own, f"seed={experiment.seed + self._seed}"])
+            plan = self._planned([*own, f"seed={experiment.seed + self._seed}"])
         title, tags = self._title_and_tags()
-        return run_training(experiment, composition, None, start, [self], title, tags, created=self._begin)
+        return run_training(plan, None, [self], run_name=title, tags=tags, created=self._begin)
 
     def _resumed(self, run: SeedRun) -> TrainResult | None:
         """Resume a run that was begun; None if there is nothing to resume."""
@@ -342,7 +339,8 @@ class TrialRun(Callback):
             self._begin(run_dir)
         title, tags = self._title_and_tags()
         try:
-            return resume_training(run_dir, [], None, [self], run_name=title, tags=tags)
+            plan = plan_resume(run_dir, [])
+            return resume_training(plan, None, [self], run_name=title, tags=tags)
         except RunEnded:
             summary = read_object(run_dir / SUMMARY)
             ending = Ending.stored(summary)
@@ -363,15 +361,12 @@ class TrialRun(Callback):
         env_steps, wall_clock_s = last.get("env_steps", 0), last.get("wall_clock_s", 0.0)
         return _as_failed(replace(run, env_steps=env_steps, wall_clock_s=wall_clock_s), reason, reason)
 
-    def _composed(self, overrides: list[str]) -> tuple[Experiment, Composition, Start | None]:
-        if self._config.parent is None:
-            return *compose_experiment(overrides, stored=True), None
-        clone = self._config.parent.clone(overrides, self._config.runs_dir, stored=True)
-        return clone.experiment, clone.composition, clone.start
+    def _planned(self, overrides: list[str]) -> TrainPlan:
+        return plan_trial(overrides, self._config.parent, stored=True)
 
     def _evaluated(self, folder: Path) -> dict[str, Any]:
-        run = resolve(str(folder), folder.parent, None)
-        stored = read_checkpoint(run.experiment, run.checkpoints, run.choose_checkpoint(None))
+        run = StoredRun(folder).with_checkpoint()
+        stored = run.read_policy()
         evaluation = Evaluator(run.experiment, self._config.protocol)(stored.networks.policy)
         self._lease.confirm()
         write_evaluation(run.path, evaluation, self._config.protocol, stored)

@@ -59,11 +59,7 @@ class SearchSpace:
         Raises:
             BadInput: there is nothing to search, a key does not exist, or no run accepts one of its values.
         """
-        if not request.space:
-            raise BadInput(
-                "sweep",
-                "nothing to search; write KEY='interval(LOW,HIGH)', KEY=A,B or sweep=NAME, such as sweep=lr_entropy",
-            )
+        request.refuse_empty()
         found = {key: dimension(key, text) for key, text in request.space.items()}
         trials = _Trials(request, check, found)
         dimensions = [

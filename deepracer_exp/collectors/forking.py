@@ -1,0 +1,28 @@
+"""The server that workers are forked from, started before the imports that take seconds."""
+
+import os
+import signal
+import sys
+
+
+def start_workers_early(wanted: bool, module: str = "deepracer_exp.collectors.worker") -> None:
+    """Start the server that workers are forked from; it imports torch, in `module`, while this process does."""
+    if not wanted or not sys.platform.startswith("linux"):
+        return
+    import multiprocessing
+    from multiprocessing import forkserver
+
+    multiprocessing.set_start_method("forkserver", force=True)
+    multiprocessing.set_forkserver_preload(["deepracer_exp.collectors.fork_server", module])
+    # Workers share the cores among themselves already; a linear-algebra thread pool in each would only compete.
+    before = os.environ.get("OMP_NUM_THREADS")
+    os.environ["OMP_NUM_THREADS"] = "1"
+    # Signals to the process group are for the training process alone. The server inherits what is ignored now.
+    handlers = {signum: signal.signal(signum, signal.SIG_IGN) for signum in (signal.SIGINT, signal.SIGTERM)}
+    forkserver.ensure_running()
+    for signum, handler in handlers.items():
+        signal.signal(signum, handler)
+    if before is None:
+        del os.environ["OMP_NUM_THREADS"]
+    else:
+        os.environ["OMP_NUM_THREADS"] = before

@@ -1,0 +1,81 @@
+"""What a training was asked, with the answers: experiment, files, runs; nothing here imports PyTorch."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from deepracer_exp.config.compose import Composition
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.parse import import_own_classes, parse_experiment
+from deepracer_exp.config.stored import with_overrides
+from deepracer_exp.env.files import RaceFiles, read_race_files
+from deepracer_exp.env.real_car import require_car
+from deepracer_exp.lookup.resolve import StoredRun, resolve
+from deepracer_exp.runs.files import PROVENANCE, read_config, read_object
+
+from .budget import refuse_ended
+
+
+@dataclass(frozen=True)
+class TrainPlan:
+    """A new run."""
+
+    experiment: Experiment
+    composition: Composition
+    """Where the values of the experiment came from."""
+    files: RaceFiles
+    teacher: StoredRun | None
+    """The run, with its checkpoint, whose policy the new one learns from; None: there is none."""
+    parent: StoredRun | None = None
+    """The run, with its checkpoint, whose networks a clone begins with; None: it is no clone."""
+
+
+def plan_training(
+    experiment: Experiment, composition: Composition, parent: StoredRun | None = None
+) -> TrainPlan:
+    """Read the files of an experiment and find its teacher; `compose_experiment` returns both arguments.
+
+    Raises:
+        BadInput: a file is missing or malformed, there is no such run, or the car that the evaluation asks for could
+            not run the policy.
+    """
+    files, teacher = read_race_files(experiment), None
+    if experiment.evaluation.real_car is not None:
+        require_car(experiment)
+    if experiment.teacher is not None:
+        uri = getattr(experiment.tracking, "uri", None)
+        teacher = resolve(experiment.teacher, Path(experiment.runs_dir), uri).with_policy()
+    return TrainPlan(experiment, composition, files, teacher, parent)
+
+
+@dataclass(frozen=True)
+class ResumePlan:
+    """A run that is continued."""
+
+    run_dir: Path
+    stored: Mapping[str, Any]
+    """Contents of its config.yaml."""
+    provenance: Mapping[str, Any]
+    """Contents of its provenance.json."""
+    composition: Composition
+    """The stored values, with the overrides."""
+    experiment: Experiment
+
+
+def plan_resume(run_dir: Path, overrides: Sequence[str]) -> ResumePlan:
+    """Apply overrides to a run that was killed, interrupted or failed.
+
+    Raises:
+        RunEnded: the run has ended.
+        BadInput: an override names something unknown or gives a value that is not accepted, or a class is not named
+            again.
+    """
+    stored, provenance = read_config(run_dir), read_object(run_dir / PROVENANCE)
+    composition = with_overrides(stored, provenance.get("names", {}), overrides)
+    # The folder may have been moved, together with all runs.
+    composition.mapping["runs_dir"] = str(run_dir.parent.parent)
+    experiment = parse_experiment(composition.mapping)
+    refuse_ended(run_dir, experiment.budget, overrides)
+    import_own_classes(experiment)
+    return ResumePlan(run_dir, stored, provenance, composition, experiment)
