@@ -32,12 +32,15 @@ class RewardFailed(RunFailed):
         car: int | None = None,
         what: str = "",
         hung: bool = False,
+        returned: bool = False,
     ) -> None:
         super().__init__(message)
         self.what = what
         """Part of the message: what the function did, and in which line."""
         self.hung = hung
         """Whether the time limit was exceeded."""
+        self.returned = returned
+        """Whether it returned something that is not a reward, so that `what` has no line."""
         self.params = params
         """The params of the call (`reward_batch`: of all cars, if the car is not known)."""
         self.car = car
@@ -227,7 +230,8 @@ class RewardFunction:
         where = f"{len(params['steps'])} cars" if car is None else f"car {car}, step {params['steps']:g}"
         what, cause = what_happened(error, self.source.path, self.time_limit_s)
         message = f"reward {self.source.name}: {function} {what} ({where})"
-        raise RewardFailed(message, params, car, what, isinstance(error, DeadlinePassed)) from cause
+        hung, returned = isinstance(error, DeadlinePassed), isinstance(error, Unusable)
+        raise RewardFailed(message, params, car, what, hung, returned) from cause
 
 
 class _Traceback(Exception):  # noqa: N818 - as `multiprocessing` has it for errors of other processes

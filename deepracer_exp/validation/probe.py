@@ -38,6 +38,7 @@ class Probe:
         start: the answer at the start.
         calls: number of calls made since.
         failures: error messages and the params that caused them, in the order of these calls.
+        without_line: the error messages of all calls that name no line, because of what the function returned.
         hangs: a call exceeded the time limit or damaged the interpreter's shared state; every later call counts as
             failed without being made.
 
@@ -49,6 +50,7 @@ class Probe:
         """Load the module of a race and call it at the start, where functions with a memory set themselves up."""
         self._function = RewardFunction(setup.reward, 1, setup.reward_time_limit_s, None, scalar=True)
         self.hangs = False
+        self.without_line: set[str] = set()
         self._forget()
         self.start = self.call(next(start(setup).params()))
         self._forget()
@@ -90,6 +92,7 @@ class Probe:
                         answers.append(Answer(self._function.compute(params)))
                     except RewardFailed as error:
                         self.hangs = error.hung
+                        self.without_line |= {error.what} if error.returned else set()
                         self.failures.append((error.what, error.params or {}))
                         answers.append(Answer(float("nan"), error.what))
         except Misconduct as error:

@@ -150,7 +150,7 @@ def try_named_situations(check: Check) -> None:
     """
     setup = check.setup
     probe = Probe(setup)
-    check.tried["start"] = _with_its_line(setup, probe.start, next(start(setup).params()))
+    check.tried["start"] = _with_its_line(setup, probe, probe.start, next(start(setup).params()))
     hangs = probe.hangs
     for case in named_situations(setup, check.against):
         answer = Answer(float("nan"), NOT_CALLED)
@@ -158,7 +158,8 @@ def try_named_situations(check: Check) -> None:
             probe = Probe(case.setup)
             answer = _act(probe, case)
             hangs = probe.hangs
-        check.tried[case.name] = _with_its_line(setup, answer, *(params for _, params in probe.failures[:1]))
+        failed_with = next((params for _, params in probe.failures), None)
+        check.tried[case.name] = _with_its_line(setup, probe, answer, failed_with)
     failed = {answer.failure for answer in check.tried.values()} - {None, NOT_CALLED}
     for what in sorted(map(str, failed)):
         names = [name for name, answer in check.tried.items() if answer.failure == what]
@@ -256,16 +257,16 @@ def _cpu_s_per_call(probe: Probe, setup: RaceSetup) -> float:
     return float(np.median(times))
 
 
-def _with_its_line(setup: RaceSetup, answer: Answer, params: dict[str, Any] | None = None) -> Answer:
+def _with_its_line(setup: RaceSetup, probe: Probe, answer: Answer, params: dict[str, Any] | None) -> Answer:
     """Return an answer with the line number in its failure, if it failed with these params."""
     if answer.failure is None or params is None:
         return answer
-    return replace(answer, failure=_with_line(setup, answer.failure, params))
+    return replace(answer, failure=_with_line(setup, probe, answer.failure, params))
 
 
-def _with_line(setup: RaceSetup, what: str, params: dict[str, Any]) -> str:
+def _with_line(setup: RaceSetup, probe: Probe, what: str, params: dict[str, Any]) -> str:
     """Prefix a bad return value with its line number, found by calling the function once more."""
-    if not what.startswith("returned"):
+    if what not in probe.without_line:
         return what
     with Coverage(setup.reward.path) as coverage:
         again = Probe(setup).call(dict(params))  # it may change them
@@ -282,7 +283,7 @@ def _failures(setup: RaceSetup, probe: Probe) -> list[str]:
         where = "off the track" if params["is_offtrack"] else "on the road"
         often = f" ({n:,} of {probe.calls:,} situations)" if n > 1 else ""
         lines.append(
-            f"{_with_line(setup, what, params)}, {where}, {params['distance_from_center']:.2f} m {side} of the "
+            f"{_with_line(setup, probe, what, params)}, {where}, {params['distance_from_center']:.2f} m {side} of the "
             f"centre line, progress {params['progress']:.1f}, steps {params['steps']:.0f}, "
             f"speed {params['speed']:.1f}, steering {params['steering_angle']:.0f}{often}"
         )
