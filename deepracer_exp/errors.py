@@ -129,17 +129,17 @@ def count(number: int, what: str) -> str:
     return f"{number:,} {what}{'s' * (number != 1)}"
 
 
-def nearest(word: str, known: Iterable[str]) -> str:
+def nearest(word: str, candidates: Iterable[str]) -> str:
     """Return `` (did you mean X?)`` for the known word nearest to `word`, or an empty string.
 
     A word that begins with it is nearest, then one that looks like it, then one that contains it.
     """
-    words, lower = list(known), word.casefold()
+    words, lower = list(candidates), word.casefold()
     long = len(word) > 2
     close = (
-        [one for one in words if long and one.startswith(word)]
-        or [one for one in words if long and one.casefold().startswith(lower)]
+        [candidate for candidate in words if long and candidate.startswith(word)]
+        or [candidate for candidate in words if long and candidate.casefold().startswith(lower)]
         or difflib.get_close_matches(word, words, n=1, cutoff=0.5)
-        or [one for one in words if long and lower in one.casefold()]
+        or [candidate for candidate in words if long and lower in candidate.casefold()]
     )
     return f" (did you mean {close[0]}?)" if close else ""

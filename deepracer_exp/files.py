@@ -54,11 +54,11 @@ def open_user_file(path: str | Path, accepted: str, most_bytes: int) -> IO[bytes
         BadInput: it is missing, not a regular file (a pipe or a device never ends), larger, or cannot be read.
     """
     with reading(path, accepted):
-        found = Path(path).stat()
-        if not stat.S_ISREG(found.st_mode):
-            kind = _KINDS.get(stat.S_IFMT(found.st_mode), "no file")
+        status = Path(path).stat()
+        if not stat.S_ISREG(status.st_mode):
+            kind = _KINDS.get(stat.S_IFMT(status.st_mode), "no file")
             raise BadInput(path, f"is {kind}", accepted)
-        _check_size(path, found.st_size, accepted, most_bytes)
+        _check_size(path, status.st_size, accepted, most_bytes)
         return Path(path).open("rb")
 
 
@@ -184,7 +184,7 @@ def _check_size(path: str | Path, size: int, accepted: str, most_bytes: int) -> 
 
 def _check_structure(text: str) -> None:
     """Refuse what would take forever to build: a few lines of aliases can stand for billions of values."""
-    known: dict[str, tuple[int, int]] = {}
+    anchors: dict[str, tuple[int, int]] = {}
     open_nodes: list[list[Any]] = [[None, 0, 0]]  # anchor, values and levels of each that is open
     for event in yaml.parse(text, _LOADER):
         if isinstance(event, yaml.CollectionStartEvent):
@@ -198,13 +198,13 @@ def _check_structure(text: str) -> None:
         elif isinstance(event, yaml.ScalarEvent):
             anchor, values, levels = event.anchor, 1, 0
         elif isinstance(event, yaml.AliasEvent):
-            if event.anchor not in known:
+            if event.anchor not in anchors:
                 raise ValueError(f"alias *{event.anchor} refers to something that is incomplete or missing")
-            anchor, (values, levels) = None, known[event.anchor]
+            anchor, (values, levels) = None, anchors[event.anchor]
         else:
             continue
         if anchor is not None:
-            known[anchor] = values, levels
+            anchors[anchor] = values, levels
         parent = open_nodes[-1]
         parent[1] += values
         parent[2] = max(parent[2], levels)

@@ -24,7 +24,7 @@ _PLAIN_TRACKING = {"kind": "mlflow", "uri": None}
 """Taken in place of a stored tracking that is not the user's own."""
 _ALERTS = ("alert_command", "alert_webhook")
 _named: dict[str, str] = {}
-"""What this command's user has named: the text of each value, and its mark in the record of this account."""
+"""Values that this command's user has named: the text of each value, and its mark in the record of this account."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Acting:
 
     key: str
     text: str
-    """How it is named."""
+    """Text that names it."""
     contents: tuple[Path, ...] = ()
     """The files of its code."""
 
@@ -95,8 +95,8 @@ def reward_file(file: str) -> Acting:
 
 def name(values: Sequence[Acting]) -> None:
     """Note that the user names these values now."""
-    for one in values:
-        _named[f"{one.key}={one.text}"] = one.mark
+    for value in values:
+        _named[f"{value.key}={value.text}"] = value.mark
 
 
 def named() -> dict[str, str]:
@@ -131,10 +131,10 @@ def leave_out_foreign(config: dict[str, Any], where: str) -> list[str]:
         where: what stores them, for the lines.
     """
     left_out = []
-    for one in list(acting(config)):
-        if one.is_own or one.key == REWARD:
+    for value in list(acting(config)):
+        if value.is_own or value.key == REWARD:
             continue
-        group, key, *_ = one.key.split(".")
+        group, key, *_ = value.key.split(".")
         advice = "repeat it to use it"
         if group == "tracking":
             if (
@@ -145,7 +145,7 @@ def leave_out_foreign(config: dict[str, Any], where: str) -> list[str]:
         else:
             config[group] = {**config[group], key: {"kind": "local"} if key == "executor" else None}
         left_out.append(
-            f"{one.key}={one.text}: not taken over from {where}, because you have not used it "
+            f"{value.key}={value.text}: not taken over from {where}, because you have not used it "
             f"before; {advice}"
         )
     return left_out

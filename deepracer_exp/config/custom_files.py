@@ -109,7 +109,9 @@ class CustomFiles:
         low, high = self.metadata.low, self.metadata.high
         if low is None or high is None:
             listed = self.metadata.actions
-            actions = [{"steering_angle": one.steering_deg, "speed": one.speed_mps} for one in listed]
+            actions = [
+                {"steering_angle": action.steering_deg, "speed": action.speed_mps} for action in listed
+            ]
             return {"kind": "discrete", "actions": actions}
         return {
             "kind": "continuous",
@@ -127,12 +129,14 @@ class CustomFiles:
     @property
     def learning(self) -> dict[str, Any]:
         """Return the values that are used, by key of hyperparameters.json; empty without the file."""
-        given = self.hyperparameters
-        if given is None:
+        settings = self.hyperparameters
+        if settings is None:
             return {}
         # The service's default is no limit in practice, so that ours is kept.
         return {
-            key: getattr(given, key) for key in TAKEN if key != "term_cond_max_episodes" or key in given.given
+            key: getattr(settings, key)
+            for key in TAKEN
+            if key != "term_cond_max_episodes" or key in settings.given
         }
 
     def remarks(self, besides: Sequence[str] = ()) -> list[str]:
@@ -159,21 +163,21 @@ class CustomFiles:
             yield "action_space: index", "ignored: an action's number is its position, as in the service"
         yield from _unknown(metadata.given, model_metadata.KEYS)
 
-    def _learning_remarks(self, given: Hyperparameters) -> Iterable[tuple[str, str]]:
-        missing = [f"{key}={value}" for key, value in self.learning.items() if key not in given.given]
+    def _learning_remarks(self, settings: Hyperparameters) -> Iterable[tuple[str, str]]:
+        missing = [f"{key}={value}" for key, value in self.learning.items() if key not in settings.given]
         if missing:
             yield ", ".join(missing), "missing in the file; the service's default is used"
-        for key in given.beyond_console():
-            yield f"{key}={getattr(given, key)}", "used, although the AWS console would not accept it"
-        if given.exploration_type != "categorical":
+        for key in settings.beyond_console():
+            yield f"{key}={getattr(settings, key)}", "used, although the AWS console would not accept it"
+        if settings.exploration_type != "categorical":
             yield (
-                f"exploration_type={given.exploration_type}",
+                f"exploration_type={settings.exploration_type}",
                 "not applicable: here actions are drawn from the policy (categorical)",
             )
-        for key in given.given:
+        for key in settings.given:
             if key in NOT_APPLICABLE:
-                yield f"{key}={getattr(given, key)}", f"not applicable: {NOT_APPLICABLE[key]}"
-        yield from _unknown(given.given, hyperparameters.KEYS)
+                yield f"{key}={getattr(settings, key)}", f"not applicable: {NOT_APPLICABLE[key]}"
+        yield from _unknown(settings.given, hyperparameters.KEYS)
 
 
 def sensor_overrides(metadata: ModelMetadata) -> list[str]:
@@ -275,7 +279,7 @@ def read_custom_files(folder: str) -> CustomFiles:
 
 def _workers(folder: str, names: Sequence[str]) -> tuple[tuple[JobSettings, ...], list[str]]:
     """Return the settings of each simulation worker, and a line for each file of such settings that is not used."""
-    numbered = {int(found[1]): name for name in names if (found := re.fullmatch(r"worker-(\d+)\.env", name))}
+    numbered = {int(match[1]): name for name in names if (match := re.fullmatch(r"worker-(\d+)\.env", name))}
     unused = []
     if "run.env" in names:
         others = {number: str(Path(folder, name)) for number, name in numbered.items()}
@@ -309,12 +313,12 @@ class FileOverrides:
     """What was used, and what was not and why, a line each."""
 
 
-def file_overrides(files: CustomFiles, own: Mapping[str, str]) -> FileOverrides:
+def file_overrides(files: CustomFiles, typed: Mapping[str, str]) -> FileOverrides:
     """Turn files into overrides.
 
     Args:
         files: the files found.
-        own: the user's own overrides by key or group; they have priority.
+        typed: the user's own overrides by key or group; they have priority.
     """
     lines: list[str] = []
     names: dict[str, str] = {}
@@ -324,7 +328,7 @@ def file_overrides(files: CustomFiles, own: Mapping[str, str]) -> FileOverrides:
 
     reward = files.paths.get("reward_function.py")
     if reward is not None:
-        winner = first_given(own, "reward", "reward.name", "reward.file")
+        winner = first_given(typed, "reward", "reward.name", "reward.file")
         if winner is None:
             names["reward"] = files.name
             lines += [override_line("reward.file", reward), override_line("reward.name", files.name)]
@@ -333,7 +337,7 @@ def file_overrides(files: CustomFiles, own: Mapping[str, str]) -> FileOverrides:
             notes.append(f"{Path(reward).name}: not used, because of {winner}")
 
     if files.action_space:
-        winner = first_given(own, "action_space", "action_space.kind", "action_space.file")
+        winner = first_given(typed, "action_space", "action_space.kind", "action_space.file")
         if winner is None:
             # Values instead of the file's path, so that config.yaml lists the actions without the file.
             values = dict(files.action_space)
@@ -345,7 +349,7 @@ def file_overrides(files: CustomFiles, own: Mapping[str, str]) -> FileOverrides:
         else:
             notes.append(f"model_metadata.json: action_space: not used, because of {winner}")
 
-    car, applied = car_override(files, own)
+    car, applied = car_override(files, typed)
     lines += car
     notes += applied
 
@@ -353,12 +357,12 @@ def file_overrides(files: CustomFiles, own: Mapping[str, str]) -> FileOverrides:
     for key, value in files.learning.items():
         target = TAKEN[key]
         group = target.partition(".")[0]
-        winner = first_given(own, group, target)
+        winner = first_given(typed, group, target)
         if key == "num_episodes_between_training":
-            frames = own.get(FRAMES)
+            frames = typed.get(FRAMES)
             if frames is not None and frames != f"{FRAMES}=null":
                 winner = winner or frames
-            elif group not in own:
+            elif group not in typed:
                 lines.append(override_line(FRAMES, None))
         if winner is None:
             taken.append(f"{target}={value}")
@@ -367,22 +371,22 @@ def file_overrides(files: CustomFiles, own: Mapping[str, str]) -> FileOverrides:
             notes.append(f"hyperparameters.json: {key}={value}: not used, because of {winner}")
     if taken:
         notes.append(f"hyperparameters.json: used as {', '.join(taken)}")
-    job, applied = job_overrides(files.workers, own)
-    notes += [*applied, *_left(files, own)]
+    job, applied = job_overrides(files.workers, typed)
+    notes += [*applied, *_left(files, typed)]
     return FileOverrides(tuple([*lines, *job]), names, (*notes, *files.remarks()))
 
 
-def car_override(files: CustomFiles, own: Mapping[str, str]) -> tuple[list[str], list[str]]:
+def car_override(files: CustomFiles, typed: Mapping[str, str]) -> tuple[list[str], list[str]]:
     """Return the override for the car of a model, unless the user chose another, and a note; none without a version."""
     if files.car is None or files.metadata is None:
         return [], []
-    winner = first_given(own, "car", "car.name")
+    winner = first_given(typed, "car", "car.name")
     used = f"used as car={files.car}" if winner is None else f"not used, because of {winner}"
     lines = [override_line("car", files.car)] if winner is None else []
     return lines, [f"model_metadata.json: version={files.metadata.version}: {used}"]
 
 
-def _left(files: CustomFiles, own: Mapping[str, str]) -> list[str]:
+def _left(files: CustomFiles, typed: Mapping[str, str]) -> list[str]:
     """Return a line for each file that is not used.
 
     Raises:
@@ -391,7 +395,7 @@ def _left(files: CustomFiles, own: Mapping[str, str]) -> list[str]:
     notes = list(files.unused)
     for name, (wanted, others) in files.left.items():
         group, key = _CHOSEN_BY[name]
-        winner = wanted if name in files.paths else first_given(own, group, key)
+        winner = wanted if name in files.paths else first_given(typed, group, key)
         # A file's name may contain line breaks.
         shown = ", ".join(" ".join(os.path.relpath(path, files.folder).split()) for path in others)
         if winner is None:
@@ -412,7 +416,7 @@ _CHOSEN_BY = {
 """The user's own overrides that stand for a file."""
 
 
-def _unknown(given: Iterable[str], known: Iterable[str]) -> Iterable[tuple[str, str]]:
-    unknown = [key for key in given if key not in known]
+def _unknown(keys: Iterable[str], used: Iterable[str]) -> Iterable[tuple[str, str]]:
+    unknown = [key for key in keys if key not in used]
     if unknown:
         yield ", ".join(unknown), "ignored, as by the service"

@@ -60,7 +60,7 @@ class Range:
             raise BadInput(
                 f"from {self.low} to {self.high}", f"more than {_MOST_VALUES:,} values to try one by one"
             )
-        return [_at(self.low, self.step, at) for at in range(last + 1)]
+        return [_at(self.low, self.step, index) for index in range(last + 1)]
 
 
 def dimension(key: str, expression: str) -> Choices | Range:
@@ -128,10 +128,10 @@ def _options(override: Override, glob: Glob) -> list[str]:
             f"{line}: glob() chooses options of a group, and {key} is not a group{nearest(key, groups())}; "
             f"groups: {', '.join(groups())}"
         )
-    known = options(key)
-    fitting = glob.filter(known)
+    names = options(key)
+    fitting = glob.filter(names)
     if not fitting:
-        raise BadInput(line, f"matches no {key}; options: {', '.join(known)}")
+        raise BadInput(line, f"matches no {key}; options: {', '.join(names)}")
     return [name if re.fullmatch(r"[\w-]+", name) else override_line("", name)[1:] for name in fitting]
 
 
@@ -141,7 +141,7 @@ def _choices(line: str, elements: Sequence[Any]) -> Choices:
         value: Choice = element
         if isinstance(element, str | QuotedString | list | dict):
             value = _expression(element)
-        if any(type(value) is type(one) and value == one for one in values):  # 1 == True
+        if any(type(value) is type(other) and value == other for other in values):  # 1 == True
             raise BadInput(line, f"{as_override('', value)[1:]} is listed twice")
         values.append(value)
     return Choices(tuple(values))

@@ -22,12 +22,12 @@ _NOT_APPLICABLE = {
 """Keys that have no effect here, the first pattern that matches, and why."""
 
 
-def job_overrides(workers: Sequence[JobSettings], own: Mapping[str, str]) -> tuple[list[str], list[str]]:
+def job_overrides(workers: Sequence[JobSettings], typed: Mapping[str, str]) -> tuple[list[str], list[str]]:
     """Turn the settings of a training into overrides.
 
     Args:
         workers: one for each simulation worker; each may have another track. Starts are those of the first.
-        own: the user's own overrides by key or group; they have priority.
+        typed: the user's own overrides by key or group; they have priority.
 
     Returns:
         The overrides, and a line for each key used, not used or not used as it is there, with the reason.
@@ -41,9 +41,9 @@ def job_overrides(workers: Sequence[JobSettings], own: Mapping[str, str]) -> tup
         return lines, notes
     first = workers[0]
     files = ", ".join(dict.fromkeys(worker.name for worker in workers))
-    winner = first_given(own, "track", "track.name", "track.file", "track.knots")
+    winner = first_given(typed, "track", "track.name", "track.file", "track.knots")
     if winner is None:
-        lines += _track_lines(workers, own)
+        lines += _track_lines(workers, typed)
     elif any(worker.world for worker in workers):
         notes.append(f"{files}: track and direction: not used, because of {winner}")
     advance = first.start_advance
@@ -52,7 +52,7 @@ def job_overrides(workers: Sequence[JobSettings], own: Mapping[str, str]) -> tup
     starts = {"episode.start_advance": advance, "episode.start_offset": first.start_offset}
     for target, value in starts.items():
         if value is not None:
-            if (winner := first_given(own, "episode", target)) is None:
+            if (winner := first_given(typed, "episode", target)) is None:
                 # A start at the end of the lap is one at its beginning.
                 lines.append(override_line(target, value % 1.0 if target.endswith("offset") else value))
             else:
@@ -69,7 +69,7 @@ def several_of(lines: Sequence[str]) -> list[str]:
     return [line for line in lines if key_of(line).partition(".")[0] == "track"] if chosen else []
 
 
-def _track_lines(workers: Sequence[JobSettings], own: Mapping[str, str]) -> list[str]:
+def _track_lines(workers: Sequence[JobSettings], typed: Mapping[str, str]) -> list[str]:
     directions: dict[str | None, list[str | None]] = {}
     for worker in workers:
         name = _world(worker)
@@ -77,12 +77,12 @@ def _track_lines(workers: Sequence[JobSettings], own: Mapping[str, str]) -> list
     if None in directions:  # the track stays what it is
         directions = {None: directions[None]}
     # A track that workers drive in both directions is driven in both by each car.
-    each = {name: found[0] if len(set(found)) == 1 else "alternate" for name, found in directions.items()}
+    each = {name: driven[0] if len(set(driven)) == 1 else "alternate" for name, driven in directions.items()}
     names = [name for name in each if name is not None]
     lines = [override_line("track", names if len(names) > 1 else names[0])] if names else []
     for name, direction in each.items():
         prefix = f"track.{name}" if len(names) > 1 else "track"
-        if direction is not None and "track.direction" not in own:
+        if direction is not None and "track.direction" not in typed:
             lines.append(override_line(f"{prefix}.direction", direction))
         if len(names) > 1 and len(directions[name]) > 1:
             lines.append(override_line(f"{prefix}.weight", len(directions[name])))
@@ -93,14 +93,14 @@ def _world(worker: JobSettings) -> str | None:
     if worker.world is None:
         return None
     variant = "" if worker.is_clockwise is None else "_cw" if worker.is_clockwise else "_ccw"
-    found = find_world(worker.world + variant) or find_world(worker.world)
-    if found is None:
+    world = find_world(worker.world + variant) or find_world(worker.world)
+    if world is None:
         raise BadInput(
             worker.file,
             f"{worker.keys['WORLD_NAME']}={worker.world[:80]}: no such world{nearest(worker.world, worlds())}",
             "a name that `deepracer-exp tracks` lists, or track=NAME beside it",
         )
-    return found
+    return world
 
 
 def _direction(worker: JobSettings, name: str | None) -> str | None:
@@ -133,16 +133,16 @@ def _remarks(workers: Sequence[JobSettings]) -> Iterator[tuple[str, str]]:
     if first.is_pretrained:
         fresh = "the training starts fresh; `deepracer-exp import MODEL` and `clone` continue one"
         yield first.name, f"{first.keys['PRETRAINED']}=True: not applied: {fresh}"
-    known = {*first.keys.values(), *FILE_KEYS.values(), "TRACK_DIRECTION_CLOCKWISE"}
+    read = {*first.keys.values(), *FILE_KEYS.values(), "TRACK_DIRECTION_CLOCKWISE"}
     unused: dict[str, list[str]] = {}
-    for key in dict.fromkeys(key for worker in workers for key in worker.given if key not in known):
+    for key in dict.fromkeys(key for worker in workers for key in worker.given if key not in read):
         why = next(why for pattern, why in _NOT_APPLICABLE.items() if re.match(pattern, key))
         unused.setdefault(why, []).append(key)
     for why, keys in unused.items():
         alike: dict[str, list[str]] = {}
         for key in keys:
             alike.setdefault(_beginning(key), []).append(key)
-        used = {_beginning(key) for key in known}
+        used = {_beginning(key) for key in read}
         shown = [
             some[0] if len(some) == 1 else f"{'other ' * (start in used)}{start}"
             for start, some in alike.items()

@@ -1,4 +1,4 @@
-"""Where option files are: `conf/` and `sweeps/` of the project, `./conf` and `./sweeps` of the working directory."""
+"""Folders of option files: `conf/` and `sweeps/` of the project, `./conf` and `./sweeps` of the working directory."""
 
 import re
 from collections.abc import Sequence
@@ -36,17 +36,17 @@ def conf_dirs() -> list[Path]:
     Raises:
         BadInput: both have an option of the same name with different contents.
     """
-    project, own = conf_dir().resolve(), Path("conf")
+    project, user = conf_dir().resolve(), Path("conf")
     try:
-        if not own.is_dir() or own.samefile(project):
+        if not user.is_dir() or user.samefile(project):
             return [project]
         for group in sorted(str(path.relative_to(project)) for path in project.rglob("*/") if path.is_dir()):
-            for path in sorted((own / group).glob("*.yaml")):
+            for path in sorted((user / group).glob("*.yaml")):
                 namesake = project / group / path.name
                 another = namesake.is_file() and namesake.read_bytes() != read_bytes(path, "an option")
                 if another or (group == "track" and path.stem in worlds() and not namesake.is_file()):
                     raise BadInput(path, f"the project has another {group} of that name; rename the file")
-        return [project, own.resolve()]
+        return [project, user.resolve()]
     except OSError as error:
         raise BadInput(
             error.filename, f"cannot be read ({error.strerror}); ./conf is for options of your own"
@@ -89,11 +89,11 @@ def options(group: str) -> list[str]:
     return sorted(files | (worlds() if group == "track" else registered(group)).keys())
 
 
-def listed(group: str, known: Sequence[str]) -> str:
+def listed(group: str, names: Sequence[str]) -> str:
     """Return a group's options for a message, or the command that lists them if there are many."""
-    if len(known) <= MOST_LISTED:
-        return ", ".join(known)
-    return f"{len(known)}, `deepracer-exp train --options {group}` lists them"
+    if len(names) <= MOST_LISTED:
+        return ", ".join(names)
+    return f"{len(names)}, `deepracer-exp train --options {group}` lists them"
 
 
 def options_of(group: str) -> dict[str, str]:

@@ -118,7 +118,7 @@ def _quoted(value: str) -> str:
 
 def _in_quotes(value: str) -> str:
     # Backslashes are literal, except in front of a quote.
-    escaped = re.sub(r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), value)
+    escaped = re.sub(r"(\\*)('|$)", lambda match: match[1] * 2 + ("\\'" if match[2] else ""), value)
     return f"'{escaped}'"
 
 
@@ -132,6 +132,6 @@ def group_of(line: str) -> str:
     return key_of(line).partition(".")[0]
 
 
-def first_given(own: Mapping[str, str], *keys: str) -> str | None:
-    """Return the first of these overrides that the user gave, None if there is none; `own` has them by key or group."""
-    return next((own[key] for key in keys if key in own), None)
+def first_given(typed: Mapping[str, str], *keys: str) -> str | None:
+    """Return the first of these overrides that the user gave, or None; `typed` has them by key or group."""
+    return next((typed[key] for key in keys if key in typed), None)

@@ -58,12 +58,12 @@ def own_option(group: str, name: str) -> dict[str, Any] | None:
     target = name if re.fullmatch(_REFERENCE, name) else registered(group).get(name)
     if target is None:
         return None
-    own = {"target": target, "kwargs": {}}
+    option = {"target": target, "kwargs": {}}
     if group == "algorithm":
-        return {"defaults": ["ppo", "_self_"], **own}
+        return {"defaults": ["ppo", "_self_"], **option}
     if group == "observation":
-        return {"defaults": ["features", "_self_"], "parts": [own]}
-    return own
+        return {"defaults": ["features", "_self_"], "parts": [option]}
+    return option
 
 
 @cache
@@ -79,9 +79,9 @@ def allow(values: Any) -> None:
 
 def allow_given(overrides: Sequence[str]) -> list[str]:
     """Allow the classes of overrides `GROUP.target=package.module:Class` and return the other overrides."""
-    given = {line: found[1] for line in overrides if (found := _GIVEN.fullmatch(line))}
-    acting.name([acting.class_of(target) for target in given.values()])
-    return [line for line in overrides if line not in given]
+    targets = {line: match[1] for line in overrides if (match := _GIVEN.fullmatch(line))}
+    acting.name([acting.class_of(target) for target in targets.values()])
+    return [line for line in overrides if line not in targets]
 
 
 def own_classes(config: Mapping[str, Any], groups: Sequence[str] = GROUPS) -> Iterator[tuple[str, str]]:
@@ -89,15 +89,15 @@ def own_classes(config: Mapping[str, Any], groups: Sequence[str] = GROUPS) -> It
     for group in groups:
         values = config.get(group)
         parts = values.get("parts") if isinstance(values, dict) else None
-        for own in (values, *(parts if isinstance(parts, list | tuple) else ())):
-            if isinstance(own, dict) and isinstance(own.get("target"), str):
-                yield group, own["target"]
+        for part in (values, *(parts if isinstance(parts, list | tuple) else ())):
+            if isinstance(part, dict) and isinstance(part.get("target"), str):
+                yield group, part["target"]
 
 
 def named_again(config: Mapping[str, Any], groups: Sequence[str] = GROUPS) -> list[str]:
     """Return the overrides that let a command import the classes of a stored run."""
-    found = own_classes(config, groups)
-    return [f"{group}.target={target}" for group, target in found if not _is_registered(target)]
+    classes = own_classes(config, groups)
+    return [f"{group}.target={target}" for group, target in classes if not _is_registered(target)]
 
 
 def load_class(target: str, key: str) -> type:
@@ -121,17 +121,17 @@ def load_class(target: str, key: str) -> type:
         sys.path.append(folder)
     module, _, name = target.partition(":")
     with reading(f"{key}={target}", "package.module:Class, installed or in the working folder"):
-        found = getattr(importlib.import_module(module), name)
-    if not isinstance(found, type):
-        raise BadInput(f"{key}={target}", f"is a {type(found).__name__}", "a class")
-    return found
+        loaded = getattr(importlib.import_module(module), name)
+    if not isinstance(loaded, type):
+        raise BadInput(f"{key}={target}", f"is a {type(loaded).__name__}", "a class")
+    return loaded
 
 
-def build_own(own: OwnClass, key: str, base: type[Base], *arguments: Any) -> Base:
+def build_own(chosen: OwnClass, key: str, base: type[Base], *arguments: Any) -> Base:
     """Build an object of a class of the user's own.
 
     Args:
-        own: the class and its keyword arguments.
+        chosen: the class and its keyword arguments.
         key: of `own.target`, for messages.
         base: that it must derive from.
         arguments: positional arguments, before the keyword arguments.
@@ -139,19 +139,19 @@ def build_own(own: OwnClass, key: str, base: type[Base], *arguments: Any) -> Bas
     Raises:
         BadInput: it cannot be imported, has another base or signature, or its constructor fails.
     """
-    kind = load_class(own.target, key)
+    kind = load_class(chosen.target, key)
     if not issubclass(kind, base):
-        raise BadInput(f"{key}={own.target}", "", f"a subclass of {base.__module__}.{base.__qualname__}")
+        raise BadInput(f"{key}={chosen.target}", "", f"a subclass of {base.__module__}.{base.__qualname__}")
     signature = inspect.signature(kind)
     try:
-        signature.bind(*arguments, **own.kwargs)
+        signature.bind(*arguments, **chosen.kwargs)
     except TypeError as error:
         raise BadInput(
-            f"{key}={own.target}: {error}; {kind.__name__}{signature} is called with {len(arguments)} arguments and "
-            f"kwargs {', '.join(own.kwargs) or 'none'}"
+            f"{key}={chosen.target}: {error}; {kind.__name__}{signature} is called with {len(arguments)} arguments and "
+            f"kwargs {', '.join(chosen.kwargs) or 'none'}"
         ) from error
-    with reading(f"{key}={own.target}"):
-        return kind(*arguments, **own.kwargs)
+    with reading(f"{key}={chosen.target}"):
+        return kind(*arguments, **chosen.kwargs)
 
 
 def _is_registered(target: str) -> bool:

@@ -1,4 +1,4 @@
-"""How an experiment is run: collection, checkpoints, budget and tracking."""
+"""Settings of a run: collection, checkpoints, budget and tracking."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal

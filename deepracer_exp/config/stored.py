@@ -43,31 +43,33 @@ def with_overrides(
     parsed = [parse_single(override) for override in overrides if override not in parts]
     values = without_passwords(dict(config))
     left_out = acting.leave_out_foreign(values, "the stored run")
-    chosen = [one for one in parsed if one.key_or_group in groups() and not one.is_delete()]
-    for one in parsed:
-        if one.key_or_group in _WHOLE:
+    chosen = [
+        override for override in parsed if override.key_or_group in groups() and not override.is_delete()
+    ]
+    for change in parsed:
+        if change.key_or_group in _WHOLE:
             raise BadInput(
-                one.input_line,
+                change.input_line,
                 "would replace the whole experiment; give the groups and values to change, such as track=Oval_track",
             )
     new: dict[str, str] = {}
     if chosen:
-        composed = compose_entry("train", [one.input_line or "" for one in chosen], stored=stored)
-        for one in chosen:
-            values[one.key_or_group] = composed.mapping[one.key_or_group]
-            new[one.key_or_group] = composed.choices[one.key_or_group]
-    for one in parsed:
-        if one not in chosen:
-            if one.is_delete() or one.package is not None:
-                raise BadInput(one.input_line, "accepted here: GROUP=OPTION or KEY=VALUE")
-            _set(values, one.key_or_group, one.value())
-    keys = [one.key_or_group for one in parsed]
+        composed = compose_entry("train", [override.input_line or "" for override in chosen], stored=stored)
+        for change in chosen:
+            values[change.key_or_group] = composed.mapping[change.key_or_group]
+            new[change.key_or_group] = composed.choices[change.key_or_group]
+    for change in parsed:
+        if change not in chosen:
+            if change.is_delete() or change.package is not None:
+                raise BadInput(change.input_line, "accepted here: GROUP=OPTION or KEY=VALUE")
+            _set(values, change.key_or_group, change.value())
+    keys = [override.key_or_group for override in parsed]
     if stored:
         left_out += acting.leave_out_foreign(values, "the study")
     else:
-        for one in parsed:
-            allow({one.key_or_group.rpartition(".")[2]: one.value()})
-        acting.name([one for one in acting.acting(values) if _touches(keys, one.key)])
+        for change in parsed:
+            allow({change.key_or_group.rpartition(".")[2]: change.value()})
+        acting.name([value for value in acting.acting(values) if _touches(keys, value.key)])
     return Composition(
         overrides=tuple(overrides),
         choices={**choices, **new},
@@ -84,14 +86,14 @@ def config_differences(configs: Sequence[Mapping[str, Any]], prefix: str = "") -
         configs: the values of each configuration.
         prefix: prefix of the keys.
     """
-    found: dict[str, list[Any]] = {}
+    differences: dict[str, list[Any]] = {}
     for key in dict.fromkeys(key for config in configs for key in config):
         values = [config.get(key, ABSENT) for config in configs]
         if all(isinstance(value, Mapping) for value in values):
-            found |= config_differences(values, f"{prefix}{key}.")
+            differences |= config_differences(values, f"{prefix}{key}.")
         elif any(value != values[0] for value in values):
-            found[f"{prefix}{key}"] = values
-    return found
+            differences[f"{prefix}{key}"] = values
+    return differences
 
 
 def describe_differences(different: Mapping[str, Sequence[Any]]) -> list[str]:
@@ -113,13 +115,13 @@ def _set(values: dict[str, Any], key: str, value: Any) -> None:
 
 def _touches(overridden: Sequence[str], key: str) -> bool:
     """Return whether one of the overridden keys is a key, its group, or a part of it."""
-    return any(f"{key}.".startswith(f"{one}.") or one.startswith(f"{key}.") for one in overridden)
+    return any(f"{key}.".startswith(f"{prefix}.") or prefix.startswith(f"{key}.") for prefix in overridden)
 
 
-def _unknown(key: str, at: str, node: Any) -> BadInput:
-    known = [str(name) for name in node] if isinstance(node, dict) else []
-    leaf = at.rpartition(".")[2]
-    return Unknown(key, f"no such key{nearest(leaf, known)}; known there: {', '.join(known) or 'none'}")
+def _unknown(key: str, where: str, node: Any) -> BadInput:
+    names = [str(name) for name in node] if isinstance(node, dict) else []
+    leaf = where.rpartition(".")[2]
+    return Unknown(key, f"no such key{nearest(leaf, names)}; known there: {', '.join(names) or 'none'}")
 
 
 def _short(value: Any) -> str:

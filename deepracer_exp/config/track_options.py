@@ -67,8 +67,8 @@ def world_values(option: str) -> dict[str, Any] | None:
         return None
     values: dict[str, Any] = {"name": world.name, "title": world.title}
     if not _OF_2018.match(world.name):
-        known = (floor for pattern, floor in _FLOORS.items() if re.match(pattern, world.name))
-        values["floor"] = _LATER_FLOOR | next(known, {})
+        floors = (floor for pattern, floor in _FLOORS.items() if re.match(pattern, world.name))
+        values["floor"] = _LATER_FLOOR | next(floors, {})
     return values
 
 
@@ -77,10 +77,10 @@ def by_world_name(override: Override) -> Override:
     value = override.value()
     if override.key_or_group != GROUP or not isinstance(value, str | list):
         return override
-    known = options(GROUP)
+    names = options(GROUP)
 
     def own(name: object) -> object:
-        return name if name in (ALL, *known) or "/" in str(name) else find_world(str(name)) or name
+        return name if name in (ALL, *names) or "/" in str(name) else find_world(str(name)) or name
 
     named = [own(name) for name in value] if isinstance(value, list) else own(value)
     return override if named == value else parse_single(override_line(GROUP, named))
@@ -102,17 +102,17 @@ def several_tracks(
     Raises:
         BadInput: a track is unknown or chosen twice, the list is empty, or a value is set for a track not chosen.
     """
-    chosen = [one for one in choosing if one.key_or_group == GROUP and not one.is_delete()]
+    chosen = [choice for choice in choosing if choice.key_or_group == GROUP and not choice.is_delete()]
     value = chosen[-1].value() if chosen else None
-    known = options(GROUP)
-    if value == ALL and ALL not in known:
+    tracks = options(GROUP)
+    if value == ALL and ALL not in tracks:
         variants = worlds().keys() - set(leaders())
-        names = tuple(name for name in known if name not in variants)
+        names = tuple(name for name in tracks if name not in variants)
     elif isinstance(value, list):
         names = tuple(str(name) for name in value)
-        _check(chosen[-1].input_line or "", names, known)
+        _check(chosen[-1].input_line or "", names, tracks)
     else:
-        _check_single(changing, known)
+        _check_single(changing, tracks)
         return (), list(changing)
     others: list[Override] = []
     of_all: list[Override] = []
@@ -130,23 +130,23 @@ def several_tracks(
     return names, [*others, *of_all, *of_one]
 
 
-def _check(line: str, names: Sequence[str], known: Sequence[str]) -> None:
+def _check(line: str, names: Sequence[str], tracks: Sequence[str]) -> None:
     if not names:
-        raise BadInput(line, "no track", f"{GROUP}=[A,B], {GROUP}={ALL}; tracks: {listed(GROUP, known)}")
-    for at, name in enumerate(names):
-        if name not in known:
+        raise BadInput(line, "no track", f"{GROUP}=[A,B], {GROUP}={ALL}; tracks: {listed(GROUP, tracks)}")
+    for index, name in enumerate(names):
+        if name not in tracks:
             raise Unknown(
-                line, f"no such track {name}{nearest(name, known)}; options: {listed(GROUP, known)}"
+                line, f"no such track {name}{nearest(name, tracks)}; options: {listed(GROUP, tracks)}"
             )
-        if name in names[:at]:
+        if name in names[:index]:
             raise BadInput(line, f"{name} is listed twice; {GROUP}.{name}.weight=2 gives it twice the cars")
 
 
-def _check_single(changing: Sequence[Override], known: Sequence[str]) -> None:
+def _check_single(changing: Sequence[Override], tracks: Sequence[str]) -> None:
     for override in changing:
         group, _, key = override.key_or_group.partition(".")
         name, _, key = key.partition(".")
-        if group == GROUP and name in known:
+        if group == GROUP and name in tracks:
             raise BadInput(
                 override.key_or_group,
                 f"accepted with several tracks ({GROUP}=[A,B]) only; with one track write {GROUP}.{key}",

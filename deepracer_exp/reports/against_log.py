@@ -59,7 +59,7 @@ class Laps:
     episodes: pd.DataFrame
     """One row a lap, `tables.EPISODE_COLUMNS`."""
     words: str
-    """Which laps they are."""
+    """Description of the laps."""
     chosen: bool = False
     """Whether they were chosen because they are complete."""
 
@@ -75,20 +75,22 @@ class Laps:
 
     def along(self, column: str, closed: bool) -> Values:
         """Return the mean of a column over `_SMOOTHED` steps at `PLACES`, (laps, places); NaN where no lap passed."""
-        found = np.full((len(self.episodes), len(PLACES)), np.nan)
+        table = np.full((len(self.episodes), len(PLACES)), np.nan)
         for lap, rows in self.steps.groupby(self.number):
             values = rows[column].rolling(_SMOOTHED, center=True, min_periods=1).mean().to_numpy(np.float64)
-            known = np.isfinite(values)
-            if not known.any():
+            finite = np.isfinite(values)
+            if not finite.any():
                 continue
-            at = rows["lap_position"].to_numpy(np.float64)[known]
-            apart = np.abs(PLACES[:, None] - at).min(axis=1)
+            positions = rows["lap_position"].to_numpy(np.float64)[finite]
+            apart = np.abs(PLACES[:, None] - positions).min(axis=1)
             if closed:
-                apart = np.minimum(apart, np.abs(np.abs(PLACES[:, None] - at) - 1.0).min(axis=1))
-            order = np.argsort(at, kind="stable")
-            passed = np.interp(PLACES, at[order], values[known][order], period=1.0 if closed else None)
-            found[lap] = np.where(apart <= _NEAR, passed, np.nan)
-        return found
+                apart = np.minimum(apart, np.abs(np.abs(PLACES[:, None] - positions) - 1.0).min(axis=1))
+            order = np.argsort(positions, kind="stable")
+            passed = np.interp(
+                PLACES, positions[order], values[finite][order], period=1.0 if closed else None
+            )
+            table[lap] = np.where(apart <= _NEAR, passed, np.nan)
+        return table
 
     def measures(self) -> dict[str, float]:
         """Return the numbers that are compared, by their names with units; NaN where there is none."""
@@ -157,16 +159,16 @@ class Stretch:
     """A part of the track."""
 
     begin: int
-    """Per cent of the track from waypoint 0."""
+    """Begin of the stretch in per cent of the track from waypoint 0."""
     end: int
-    """Likewise; at most 100 also behind the start line."""
+    """End of the stretch in per cent of the track; at most 100 also behind the start line."""
     first_waypoint: int
     last_waypoint: int
     sector: str
     offset_m: float
-    """How much further left the simulated line is, mean."""
+    """Mean distance of the simulated line to the left of the logged one."""
     speed_mps: float
-    """How much faster the simulated car is, mean."""
+    """Mean speed of the simulated car above the logged one."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -208,7 +210,7 @@ class AgainstLog:
             return np.zeros(0), np.zeros(0)
         n, m = len(self.logged.driven), len(self.actions.names)
         counts = (totals(part, None, m) for part in np.split(self.actions.number, [n]))
-        logged, simulated = (100.0 * one / max(one.sum(), 1.0) for one in counts)
+        logged, simulated = (100.0 * counted / max(counted.sum(), 1.0) for counted in counts)
         return logged, simulated
 
     @property
@@ -250,8 +252,8 @@ class AgainstLog:
         whole = np.isfinite(apart[windows]).all(axis=1)
         if not whole.any():
             return None
-        at = int(np.where(whole, np.nan_to_num(apart)[windows].mean(axis=1), -1.0).argmax())
-        begin, end = at / len(PLACES), (at + STRETCH) / len(PLACES)
+        first = int(np.where(whole, np.nan_to_num(apart)[windows].mean(axis=1), -1.0).argmax())
+        begin, end = first / len(PLACES), (first + STRETCH) / len(PLACES)
         waypoint_at = waypoint_positions(self.course)[: len(self.course.waypoints) - self.course.closed]
         inside = np.flatnonzero(((waypoint_at - begin) % 1.0) <= end - begin)
         inside = inside[np.argsort((waypoint_at[inside] - begin) % 1.0)]
@@ -263,8 +265,8 @@ class AgainstLog:
             first_waypoint=int(inside[0]) if len(inside) else 0,
             last_waypoint=int(inside[-1]) if len(inside) else 0,
             sector=sectors[int(sector_at(sectors, middle)[0])].name,
-            offset_m=float(offset_m[windows[at]].mean()),
-            speed_mps=float(speed_mps[windows[at]].mean()),
+            offset_m=float(offset_m[windows[first]].mean()),
+            speed_mps=float(speed_mps[windows[first]].mean()),
         )
 
     @property
@@ -272,27 +274,27 @@ class AgainstLog:
         """The result in words: lap times, line, and where they differ most."""
         logged, simulated = (laps.episodes["lap_time_s"] for laps in (self.logged, self.simulated))
         if not len(simulated.dropna()):
-            found = ["The simulated car completes no lap."]
+            lines = ["The simulated car completes no lap."]
         elif not len(logged.dropna()):
-            found = ["The logged car completes no lap."]
+            lines = ["The logged car completes no lap."]
         else:
-            found = [
+            lines = [
                 f"The simulated lap takes {simulated.median():.2f} s, the logged one {logged.median():.2f} s: "
                 f"{simulated.median() - logged.median():+.2f} s (medians)."
             ]
         offset_m, speed_mps = (np.abs(self.difference(name)) for name in ("offset_m", "track_speed_mps"))
-        one = self.stretch
-        if one is None:
-            return [*found, "They have no stretch of the track in common that is long enough to compare."]
+        apart = self.stretch
+        if apart is None:
+            return [*lines, "They have no stretch of the track in common that is long enough to compare."]
         if max(np.nanmax(offset_m), np.nanmax(speed_mps)) < _SAME:
-            return [*found, "Line and speed are the same all along the track, to 1 cm and 0.01 m/s."]
+            return [*lines, "Line and speed are the same all along the track, to 1 cm and 0.01 m/s."]
         return [
-            *found,
+            *lines,
             f"The lines are {np.nanmean(offset_m):.2f} m apart on average, the speeds {np.nanmean(speed_mps):.2f} m/s.",
-            f"They differ most from {one.begin} to {one.end}% of the track (waypoints {one.first_waypoint} to "
-            f"{one.last_waypoint}, sector {one.sector}): there the simulated car is {abs(one.offset_m):.2f} m further "
-            f"{'left' if one.offset_m > 0 else 'right'} and {abs(one.speed_mps):.2f} m/s "
-            f"{'faster' if one.speed_mps > 0 else 'slower'}.",
+            f"They differ most from {apart.begin} to {apart.end}% of the track (waypoints {apart.first_waypoint} to "
+            f"{apart.last_waypoint}, sector {apart.sector}): there the simulated car is {abs(apart.offset_m):.2f} m "
+            f"further {'left' if apart.offset_m > 0 else 'right'} and {abs(apart.speed_mps):.2f} m/s "
+            f"{'faster' if apart.speed_mps > 0 else 'slower'}.",
         ]
 
 
@@ -304,9 +306,9 @@ def quantile(curves: Values, share: float) -> Values:
 def lines_compared(both: AgainstLog) -> Chart:
     """Draw the lines of all laps and their medians on the course, and the stretch where they differ most."""
     layers: list[Layer] = []
-    if (one := both.stretch) is not None:
-        end = one.end if one.end > one.begin else one.end + 100
-        there = both.course.points_at(np.linspace(one.begin, end, 60) / 100.0 % 1.0)
+    if (stretch := both.stretch) is not None:
+        end = stretch.end if stretch.end > stretch.begin else stretch.end + 100
+        there = both.course.points_at(np.linspace(stretch.begin, end, 60) / 100.0 % 1.0)
         layers.append(line(there[:, 0], there[:, 1], VERMILION, "where they differ most", width=9.0))
     for laps, color in zip((both.logged, both.simulated), SIDES.values(), strict=True):
         # NaN between the laps.
@@ -364,9 +366,9 @@ def actions_compared(both: AgainstLog) -> Chart | None:
     if both.actions is None:
         return None
     # From left to right, as on the road seen from above.
-    at, names = np.arange(len(both.actions.names)), both.actions.names[::-1]
+    places, names = np.arange(len(both.actions.names)), both.actions.names[::-1]
     layers = [
-        bars(at + side * 0.2, share[::-1], color, name, width=0.38)
+        bars(places + side * 0.2, share[::-1], color, name, width=0.38)
         for side, share, (name, color) in zip((-1, 1), both.action_shares, SIDES.items(), strict=True)
     ]
     return Chart(

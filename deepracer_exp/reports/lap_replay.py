@@ -38,7 +38,7 @@ class ReplayedLap:
     name: str
     """The run or log that it is of."""
     words: str
-    """Which of its laps it is."""
+    """Description of the lap."""
     track: Track
     lap_time_s: float
     """NaN of a lap that is not complete."""

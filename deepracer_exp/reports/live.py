@@ -40,12 +40,12 @@ _LAST = "last"
 _NICENESS = 19
 
 Used: TypeAlias = Callable[[int, int, float], tuple[str, float]]
-"""What a training has used of its budget after control steps, iterations and seconds: `Budget.used`."""
+"""Returns the used share of a budget after control steps, iterations and seconds: `Budget.used`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Laps:
-    """What a checkpoint has driven, as the page shows it."""
+    """The laps of a checkpoint, as the page shows them."""
 
     words: str
     plot: Plot
@@ -108,13 +108,13 @@ class LivePage:
             evaluator(policy, again)
             best = again.lap(best_attempt(evaluation))
             strip = glimpses(best, again.acted, policy, evaluator.race.setup.actions, camera)
-        known = trained_on(self._run.experiment, self._protocol, evaluation)
+        trained = trained_on(self._run.experiment, self._protocol, evaluation)
         chart = newest_laps(track_lines(evaluator, evaluation, recorder))
         return _Laps(
             words=f"checkpoint {stored.path.name}, {stored.counters['env_steps']:,} steps",
             plot=plot_of(chart),
             caption=chart.caption,
-            table=results_table(evaluation, self._protocol, known, Console(width=200)),
+            table=results_table(evaluation, self._protocol, trained, Console(width=200)),
             strip=strip,
         )
 
@@ -128,7 +128,7 @@ class LivePage:
         page = render(
             __package__,
             "live.html.j2",
-            [one for one in (curves, None if laps is None else laps.plot) if one is not None],
+            [plot for plot in (curves, None if laps is None else laps.plot) if plot is not None],
             is_live=True,
             scripts=["live.js"],
             version=version,
@@ -140,7 +140,9 @@ class LivePage:
             curves=curves,
             laps=laps,
             heads=[] if laps is None else [str(column.header) for column in laps.table.columns],
-            rows=[] if laps is None else list(zip(*(one.cells for one in laps.table.columns), strict=True)),
+            rows=[]
+            if laps is None
+            else list(zip(*(column.cells for column in laps.table.columns), strict=True)),
             note="" if laps is None or laps.table.caption is None else str(laps.table.caption),
             waiting="its laps are being driven"
             if (self._run.checkpoints / _LAST).exists()

@@ -98,11 +98,11 @@ class LogPage:
     findings: Sequence[Finding]
     """The most important first."""
     replay: ReplayedRewards | None = None
-    """The same driving, paid by another reward function."""
+    """The rewards of another function for the same driving."""
     terms: pd.DataFrame | None = None
-    """What each term of the reward function contributed, as `contributed_terms` returns it."""
+    """Contribution of each term of the reward function, as `contributed_terms` returns it."""
     strip: Sequence[Glimpse] = ()
-    """What the best policy sees along a lap."""
+    """Pictures that the best policy sees along a lap."""
 
 
 def write_report(log: Recording | RunRecording, path: Path) -> Path:
@@ -136,8 +136,8 @@ def draw_sections(page: LogPage) -> dict[str, list[Chart]]:
     drawn[_BESIDE] += [generations([view]), generalisation_matrix([policy_of(view)])]
     if page.terms is not None:
         drawn[_PAID].append(rewards.reward_terms(view, page.terms))
-    known = {title: [chart for chart in some if chart is not None] for title, some in drawn.items()}
-    return {title: some for title, some in known.items() if some}
+    drawable = {title: [chart for chart in some if chart is not None] for title, some in drawn.items()}
+    return {title: some for title, some in drawable.items() if some}
 
 
 def html(page: LogPage) -> str:
@@ -160,7 +160,7 @@ def html(page: LogPage) -> str:
         name=view.name,
         headline=headline(view),
         picture=plots[_PICTURE] if _PICTURE in first else None,
-        findings=[_finding(one, plots) for one in page.findings],
+        findings=[_finding(finding, plots) for finding in page.findings],
         problem_count=count(len(view.problems), "problem") if view.problems else "",
         replay=page.replay,
         candidates=candidate_rows(view),
@@ -202,7 +202,7 @@ def _first_screen(page: LogPage) -> dict[str, Any]:
             }
     except BadInput:
         pass  # the page lists which files could not be read
-    submit = [("", one.sentence) for one in page.findings if one.rule == "submit"]
+    submit = [("", finding.sentence) for finding in page.findings if finding.rule == "submit"]
     return {
         "title": page.view.name,
         "outcome": facts(page.view),
@@ -211,11 +211,13 @@ def _first_screen(page: LogPage) -> dict[str, Any]:
     }
 
 
-def _finding(one: Finding, plots: Mapping[str, Plot]) -> dict[str, Any]:
-    numbers = dict(one.values) | {f"{key} (threshold)": value for key, value in one.thresholds.items()}
+def _finding(finding: Finding, plots: Mapping[str, Plot]) -> dict[str, Any]:
+    numbers = dict(finding.values) | {
+        f"{key} (threshold)": value for key, value in finding.thresholds.items()
+    }
     return {
-        "sentence": one.sentence,
-        "figure": one.figure if one.figure in plots else None,
+        "sentence": finding.sentence,
+        "figure": finding.figure if finding.figure in plots else None,
         "numbers": [
             (key.replace("_", " "), f"{value:.5g}" if isinstance(value, float) else str(value))
             for key, value in numbers.items()

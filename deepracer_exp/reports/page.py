@@ -31,7 +31,7 @@ class Plot:
     height: int
     """Pixels it takes, kept free until it is drawn."""
     phone_height: int
-    """The same on a narrow screen."""
+    """Height on a narrow screen."""
     least_width: int
     """Pixels below which it scrolls sideways; 0: it gets as narrow as the page."""
     packed: str
@@ -40,11 +40,11 @@ class Plot:
 
 @dataclass(frozen=True)
 class Glimpse:
-    """What a policy saw in one step of a lap; both pictures as `png_uri` returns them."""
+    """A policy's view in one step of a lap; both pictures as `png_uri` returns them."""
 
     seen: str
     looked: str
-    """The same picture under its saliency."""
+    """The picture under its saliency."""
     where: str
     decision: str
 
@@ -106,8 +106,8 @@ def render(
     )
     # The colour of a figure for CSS.
     environment.filters["themed"] = lambda color: f"light-dark({color}, {DARK.get(color.lower(), color)})"
-    own = [(__package__, "page.js"), *((package, name) for name in scripts)]
-    texts = [(files(place) / name).read_text(encoding="utf-8") for place, name in own]
+    sources = [(__package__, "page.js"), *((package, name) for name in scripts)]
+    texts = [(files(place) / name).read_text(encoding="utf-8") for place, name in sources]
     return environment.get_template(template).render(
         policy=_policy(*texts, get_plotlyjs()) + ("; connect-src 'self'" if is_live else ""),
         contents=[],

@@ -1,4 +1,4 @@
-"""What a training leaves to look at: its pictures and its page."""
+"""The pictures and the page of a training."""
 
 import logging
 from collections.abc import Sequence

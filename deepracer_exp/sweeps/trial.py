@@ -15,11 +15,11 @@ class SeedRun:
     seed: int
     """Index of the seed, from 0."""
     run_dir: str | None = None
-    """None if the trial failed before the run was begun."""
+    """Folder of the run; None if the trial failed before it was begun."""
     status: str | None = None
     """Status in the run's summary; None while the run is under way."""
     ending: str = ""
-    """What ended the run, a key of `ENDINGS`."""
+    """Ending of the run, a key of `ENDINGS`."""
     reason: str = ""
     """One line."""
     traceback: str = ""
@@ -36,7 +36,7 @@ class SeedRun:
     held_out_completion: float | None = None
     mlflow_run_id: str | None = None
     tries: int = 1
-    """How often the run was started or resumed at the same checkpoint."""
+    """Number of starts or resumes of the run at the same checkpoint."""
     tried_at: int = 0
     """Iteration of that checkpoint, 0 without any."""
 
@@ -68,7 +68,7 @@ class Trial:
 
     @property
     def ending(self) -> str:
-        """What ended the last run, a key of `ENDINGS`."""
+        """Ending of the last run, a key of `ENDINGS`."""
         return self.runs[-1].ending if self.runs else ""
 
     @property
@@ -113,7 +113,7 @@ class Trial:
         return {"runs": runs_as_json(self.runs), **together}
 
     def _mean(self, value: Callable[[SeedRun], float | None]) -> float | None:
-        values = [found for run in self.runs if (found := value(run)) is not None]
+        values = [figure for run in self.runs if (figure := value(run)) is not None]
         return sum(values) / len(values) if values else None
 
 

@@ -28,7 +28,7 @@ class Board:
     """Name of the race."""
     racers: int
     timing: Literal["TOTAL_TIME", "AVG_LAP_TIME", "BEST_LAP_TIME"]
-    """What counted of the laps: their total, their average, or the best of them."""
+    """Measure of the laps that counted: their total, their average, or the best of them."""
     laps: int
     """Laps that counted."""
     off_track_penalty_s: float | None
@@ -37,7 +37,7 @@ class Board:
     """The fastest single lap."""
     winner_s: float
     first_1_percent_s: float
-    """Of the last racer among the first 1 %; likewise the next two."""
+    """Lap time of the last racer among the first 1 %; the next two are those of 10 % and 50 %."""
     first_10_percent_s: float
     half_s: float
 
@@ -89,7 +89,7 @@ def boards_of(world: str) -> tuple[Board, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class Standing:
-    """Where the laps of a policy would stand on a board, and how they differ from those of its racers."""
+    """The place of a policy's laps on a board, and how they differ from those of its racers."""
 
     board: Board
     lap_s: float
@@ -99,9 +99,9 @@ class Standing:
     car: str
     """The car that drove."""
     sees: str
-    """What the policy sees, after ``from``."""
+    """Sensors of the policy in words, after ``from``."""
     off_track: str | None
-    """What leaving the track costs, where that is not what it cost there."""
+    """Cost of leaving the track in words, where it differs from the board's."""
 
     @property
     def is_comparable(self) -> bool:
@@ -156,7 +156,7 @@ def standings(
         sees: what the policy sees, such as `a camera` or `features`.
         off_track_penalty_s: what it cost to leave the track; None: it ended the lap.
     """
-    found = []
+    places = []
     for board in boards_of(world):
         best_s = best_lap_s if board.timing == "BEST_LAP_TIME" else None
         there = board.off_track_penalty_s
@@ -164,7 +164,7 @@ def standings(
         if there is not None and there != off_track_penalty_s:
             here = "it ends a lap" if off_track_penalty_s is None else f"{off_track_penalty_s:g} s"
             off_track = f"leaving the track cost {there:g} s there, here {here}"
-        found.append(
+        places.append(
             Standing(
                 board=board,
                 lap_s=mean_lap_s if best_s is None else best_s,
@@ -174,10 +174,10 @@ def standings(
                 off_track=off_track,
             )
         )
-    return sorted(found, key=lambda one: (not one.is_comparable, -one.board.racers))
+    return sorted(places, key=lambda standing: (not standing.is_comparable, -standing.board.racers))
 
 
 def what_it_sees(camera: object, lidar: object) -> str:
     """Return what a policy sees in words, by whether its observation has a camera and a LIDAR."""
-    seen = [name for name, one in (("a camera", camera), ("a LIDAR", lidar)) if one is not None]
+    seen = [name for name, sensor in (("a camera", camera), ("a LIDAR", lidar)) if sensor is not None]
     return " and ".join(seen) or "features"

@@ -51,9 +51,9 @@ def draw_terminal(track: Track, columns: int, rows: int) -> str:
     scale = float(((dots - 1) / np.maximum(high - low, 1e-9)).min())
 
     def dot(points: np.ndarray) -> np.ndarray:
-        at = np.rint((points - low) * scale).astype(np.int64)
-        at[:, 1] = round((high - low)[1] * scale) - at[:, 1]
-        return at
+        places = np.rint((points - low) * scale).astype(np.int64)
+        places[:, 1] = round((high - low)[1] * scale) - places[:, 1]
+        return places
 
     width, height = dot(np.array([[high[0], low[1]]]))[0] + 1
     image = np.zeros((-(-height // 4) * 4, -(-width // 2) * 2), bool)
@@ -161,8 +161,8 @@ def _facts(track: Track) -> str:
 def _dense(line: np.ndarray, step_m: float) -> np.ndarray:
     """Return points at most `step_m` apart along a polyline."""
     start_m = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))]
-    at = np.linspace(0.0, start_m[-1], int(start_m[-1] / step_m) + 2)
-    return np.column_stack([np.interp(at, start_m, line[:, k]) for k in (0, 1)])
+    places_m = np.linspace(0.0, start_m[-1], int(start_m[-1] / step_m) + 2)
+    return np.column_stack([np.interp(places_m, start_m, line[:, k]) for k in (0, 1)])
 
 
 def area_patch(rings: Sequence[Points], **style: Any) -> PathPatch:
@@ -197,10 +197,10 @@ def _roomier_border(track: Track) -> np.ndarray:
 def _chevrons(track: Track) -> np.ndarray:
     """Return arrow heads (count, 3, 2) on the centre line that point in driving direction."""
     size_m = 0.28 * track.width_m
-    at = track.width_m / track.length_m + np.arange(max(1, round(track.length_m / CHEVRON_M))) * (
+    places = track.width_m / track.length_m + np.arange(max(1, round(track.length_m / CHEVRON_M))) * (
         CHEVRON_M / track.length_m
     )
-    pose = track.start_pose(at)
+    pose = track.start_pose(places)
     ahead = np.column_stack([np.cos(pose.yaw_rad), np.sin(pose.yaw_rad)])
     left = np.column_stack([-ahead[:, 1], ahead[:, 0]])
     tip = np.column_stack([pose.x, pose.y])

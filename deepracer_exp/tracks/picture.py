@@ -27,8 +27,8 @@ def draw_track(track: Track, pixels_per_m: float) -> Image.Image:
     draw = ImageDraw.Draw(image)
 
     def pixels(points: NDArray[np.float64]) -> list[tuple[float, float]]:
-        at = (points - low) * scale
-        return [(x, height - y) for x, y in at.tolist()]
+        scaled = (points - low) * scale
+        return [(x, height - y) for x, y in scaled.tolist()]
 
     for around, *holes in outline.polygons:
         draw.polygon(pixels(around), fill=track.floor.road_color)

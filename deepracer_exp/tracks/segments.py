@@ -22,7 +22,7 @@ CELL_M = 0.1
 """Side of a grid cell; doubled until the grid has at most `MOST_CELLS`."""
 MOST_CELLS = 400_000
 MARGIN_M = 1.0
-"""How far the grid reaches beyond the polyline; points farther out are answered by a full scan."""
+"""Metres that the grid reaches beyond the polyline; points farther out are answered by a full scan."""
 SPLIT = 8
 """Fine cells to the side of a coarse one, which narrows the search while the grid is built."""
 BAND_M = 0.1
@@ -45,7 +45,7 @@ class Segments(NamedTuple):
     start_m: np.ndarray
     """Distance of each vertex from its line's first along the line."""
     share: np.ndarray
-    """The same as a share of the whole line, 0 to 1."""
+    """Position along the line as a share of its whole length, 0 to 1."""
     heading_rad: np.ndarray
     """Direction of each segment."""
     point: np.ndarray
@@ -263,20 +263,20 @@ def nearest_segment(s, line, px, py):  # type: ignore[no-untyped-def]
     """Return the row of the line's segment nearest to (px, py) and the fraction along it (nan for a nan point)."""
     column = (px - s.low_x[line]) / s.cell_m[line]
     row = (py - s.low_y[line]) / s.cell_m[line]
-    best, found, fraction = np.inf, s.at[line], np.nan
+    best, nearest, fraction = np.inf, s.at[line], np.nan
     if 0.0 <= column < s.columns[line] and 0.0 <= row < s.rows[line]:
         cell = s.cell_at[line] + int(row) * s.columns[line] + int(column)
         for k in range(s.first[cell], s.first[cell + 1]):
             index = s.member[k]
             d, f = squared_distance(s.x, s.y, index, px, py)
             if d < best:
-                best, found, fraction = d, index, f
+                best, nearest, fraction = d, index, f
     else:
         for index in range(s.at[line], s.at[line] + s.segments[line]):
             d, f = squared_distance(s.x, s.y, index, px, py)
             if d < best:
-                best, found, fraction = d, index, f
-    return found, fraction
+                best, nearest, fraction = d, index, f
+    return nearest, fraction
 
 
 @njit(cache=True, nogil=True)

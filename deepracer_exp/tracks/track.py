@@ -40,7 +40,7 @@ class Projection(NamedTuple):
     ndist: np.ndarray
     """Share of the course from waypoint 0 to the projection, 0 to 1."""
     distance_m: np.ndarray
-    """The same in metres."""
+    """Position along the centre line in metres."""
     offset_m: np.ndarray
     """Distance from the centre line, positive on the left of the driving direction."""
     previous: np.ndarray
@@ -255,8 +255,8 @@ def world_track(name: str, reversed: bool = False) -> Track:
     Raises:
         BadInput: there is no such world.
     """
-    found = find_world(name) or name
-    return Track.from_route(world_rows(found), found, title=worlds()[found].title, reversed=reversed)
+    world = find_world(name) or name
+    return Track.from_route(world_rows(world), world, title=worlds()[world].title, reversed=reversed)
 
 
 class Tracks:

@@ -197,8 +197,8 @@ def validator_params(track: Track) -> dict[str, dict[str, Any]]:
     width_m = math.dist(inner[0], outer[0])
     to_outer = (outer[0] - center[0]) / math.dist(outer[0], center[0])
     beside = center[0] + to_outer * width_m
-    at = np.linspace(0, n, _OBJECTS, endpoint=False, dtype=np.intp)
-    distances_m = track.length_m * (at + 1) / n
+    waypoint = np.linspace(0, n, _OBJECTS, endpoint=False, dtype=np.intp)
+    distances_m = track.length_m * (waypoint + 1) / n
 
     def params(
         x_y: np.ndarray,
@@ -227,7 +227,7 @@ def validator_params(track: Track) -> dict[str, dict[str, Any]]:
             "is_reversed": True,
             "track_length": float(np.hypot(*np.diff(inner, axis=0).T).sum()),
             "closest_objects": [0, 1],
-            "objects_location": center[at].tolist(),
+            "objects_location": center[waypoint].tolist(),
             "objects_left_of_center": [True, True, False, True, False, True],
             "object_in_camera": True,
             "objects_speed": [0.2] * _OBJECTS,

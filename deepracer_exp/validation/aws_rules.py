@@ -1,4 +1,4 @@
-"""What AWS says about the text of a reward function: deepracer-on-aws' validator, and the console's documentation."""
+"""Checks of a reward function's text by AWS: deepracer-on-aws' validator, and the console's documentation."""
 
 import ast
 import io
@@ -53,11 +53,11 @@ def text_findings(text: str) -> list[AwsFinding]:
     The rules are those of its source/libs/reward-function-validation. The text must be valid Python. What that
     validator finds by calling the function is in `aws_dry_run`.
     """
-    found: list[AwsFinding] = []
+    findings: list[AwsFinding] = []
     if len(text) > LONGEST:
-        found.append(AwsFinding(0, f"{len(text):,} characters of code; at most {LONGEST:,} are accepted"))
+        findings.append(AwsFinding(0, f"{len(text):,} characters of code; at most {LONGEST:,} are accepted"))
     tree = ast.parse(text)
-    return sorted({*found, *_imports(tree), *_calls(tree), *_words(text), *style_findings(text)})
+    return sorted({*findings, *_imports(tree), *_calls(tree), *_words(text), *style_findings(text)})
 
 
 def _imports(tree: ast.Module) -> Iterator[AwsFinding]:
@@ -148,10 +148,10 @@ def style_findings(text: str) -> list[AwsFinding]:
     lines = io.StringIO(text).readlines()  # splitlines would also split at form feeds
     guide = pycodestyle.StyleGuide(ignore=list(_IGNORED), reporter=_Report)
     pycodestyle.Checker(lines=lines, options=guide.options).check_all()
-    found = {(finding, finding.text[:4]) for finding in guide.options.report.found}
+    codes = {(finding, finding.text[:4]) for finding in guide.options.report.found}
     for message in Flakes(ast.parse(text)).messages:
-        found.add((AwsFinding(message.lineno, f"F {message.message % message.message_args}", "style"), "F"))
-    return sorted(finding for finding, code in found if not _excused(lines, finding.line, code))
+        codes.add((AwsFinding(message.lineno, f"F {message.message % message.message_args}", "style"), "F"))
+    return sorted(finding for finding, code in codes if not _excused(lines, finding.line, code))
 
 
 def _excused(lines: list[str], line: int, code: str) -> bool:

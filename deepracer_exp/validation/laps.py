@@ -17,7 +17,7 @@ from .situations import Situations
 Floats = NDArray[np.float64]
 
 SHARES = (0.6, 0.8, 1.0)
-"""Of the highest speed at each place at which the laps are driven."""
+"""Shares of the highest speed at each place at which the laps are driven."""
 _LATERAL_MPS2 = (6.0, 5.0, 4.0, 3.0, 2.0, 1.0)
 """Lateral acceleration in bends; the first one with which all laps stay on the road is used."""
 # Gains of the driver, chosen so that both the car of version 4, whose wheels lag commands by half a second, and the
@@ -49,8 +49,8 @@ def action_space_laps(setup: RaceSetup) -> list[DrivenLap]:
     shares = [*shares[:-1], 1.0]
     best: list[DrivenLap] = []
     laps = drive_laps(setup, np.repeat(_LATERAL_MPS2, len(shares)), np.tile(shares, len(_LATERAL_MPS2)))
-    for at in range(0, len(laps), len(shares)):
-        complete = [lap for lap in laps[at : at + len(shares)] if lap is not None]
+    for first in range(0, len(laps), len(shares)):
+        complete = [lap for lap in laps[first : first + len(shares)] if lap is not None]
         if len(complete) > len(best):
             best = complete
     return best
@@ -107,9 +107,9 @@ def drive_laps(setup: RaceSetup, lateral_mps2: Floats, share: Floats) -> list[Dr
 def _bend_speed(setup: RaceSetup, now: Measures, lateral_mps2: Floats) -> Floats:
     """Return the highest speed from which a car can still brake for every bend ahead, (n,)."""
     track = setup.track
-    at = now.ndist[:, None] + _LOOK_M / track.length_m
+    place = now.ndist[:, None] + _LOOK_M / track.length_m
     around_m = 0.25
-    behind, ahead = (track.start_pose(at + side * around_m / track.length_m).yaw_rad for side in (-1, 1))
+    behind, ahead = (track.start_pose(place + side * around_m / track.length_m).yaw_rad for side in (-1, 1))
     turn_rad = np.abs(np.mod(ahead - behind + np.pi, 2 * np.pi) - np.pi)
     curvature = np.maximum(turn_rad / (2 * around_m), 1e-3)
     braking_m = np.maximum(_LOOK_M - 0.3, 0.0)

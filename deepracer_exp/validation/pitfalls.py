@@ -20,7 +20,7 @@ _FASTER = 1.1
 _MARGIN = 0.01
 """Rewards closer than this, relative, count as equal."""
 _LAP_MARGIN = 0.02
-"""The same for returns of laps, whose lines are not quite the same."""
+"""Margin for returns of laps, whose lines are not quite the same."""
 _ASKS = 0.2
 """Growth of the return, relative, per relative saving of time below which speed counts little; a race score has 1."""
 
@@ -37,12 +37,12 @@ def pays_off_the_road(of: RewardGrid) -> Iterator[str]:
     on_road, off_road = _best_by_offset(reward, ~off), _best_by_offset(reward, off)
     if on_road is None or off_road is None:
         return
-    (on, _), (beyond, at) = on_road, off_road
+    (on, _), (beyond, place) = on_road, off_road
     margin = _MARGIN * max(abs(on), abs(beyond))
     if beyond >= on - margin:
         than = "more off the track than" if beyond > on + margin else "as much off the track as"
-        side = "left" if of.offsets_m[at] > 0 else "right"
-        where = f"{abs(of.offsets_m[at]):.2f} m {side} of the centre line"
+        side = "left" if of.offsets_m[place] > 0 else "right"
+        where = f"{abs(of.offsets_m[place]):.2f} m {side} of the centre line"
         yield f"pays {than} on it: {beyond:.3g} per step {where}, at best {on:.3g} on the track"
 
 
@@ -74,9 +74,9 @@ def pays_for_standing(setup: RaceSetup, laps: list[DrivenLap]) -> Iterator[str]:
         yield f"pays for standing still: {still:.3g} per step, {moving:.3g} for driving"
 
 
-def _held(lap: Situations, at: int, step_s: float) -> Situations:
+def _held(lap: Situations, row: int, step_s: float) -> Situations:
     """Return the steps of a car that does not move after one step of a lap."""
-    held = lap[np.full(_HELD, at)]
+    held = lap[np.full(_HELD, row)]
     later = np.arange(1, _HELD + 1)
     still = np.zeros(_HELD)
     return held.given(
@@ -89,23 +89,23 @@ def _held(lap: Situations, at: int, step_s: float) -> Situations:
 
 @dataclass(frozen=True)
 class LapReturn:
-    """What a reward function returns for a driven lap."""
+    """The sum of rewards for a driven lap."""
 
     time_s: float
     total: float
     """Sum of the rewards."""
     discounted: float
-    """The same, each reward discounted from the start of the lap."""
+    """Sum of the rewards, each discounted from the start of the lap."""
 
 
 def lap_returns(setup: RaceSetup, laps: Sequence[DrivenLap], discount: float) -> list[LapReturn]:
     """Return the sums of the rewards of each lap; `discount` is the experiment's, per control step."""
-    found = []
+    returns = []
     for lap in laps:
         rewards = Probe(setup).rewards(lap.paid)
         discounted = float(rewards @ discount ** np.arange(len(rewards)))
-        found.append(LapReturn(lap.time_s, float(rewards.sum()), discounted))
-    return found
+        returns.append(LapReturn(lap.time_s, float(rewards.sum()), discounted))
+    return returns
 
 
 def slow_laps_return_as_much(laps: Sequence[LapReturn], discount: float) -> Iterator[str]:
@@ -160,9 +160,9 @@ def batch_differs(setup: RaceSetup, n: int) -> Iterator[str]:
     batch = RewardFunction(setup.reward, 1, setup.reward_time_limit_s, None)
     if not batch.is_batch:
         return
-    at = sample(setup, n)
-    before = situations(setup, at, earlier=True)
-    now = situations(setup, at).given(previous_progress=before.columns["progress"])
+    places = sample(setup, n)
+    before = situations(setup, places, earlier=True)
+    now = situations(setup, places).given(previous_progress=before.columns["progress"])
     paid, rewards = batch(now.columns, (now.road,)), Probe(setup).rewards(now, before)
     wrong = np.flatnonzero(~np.isclose(paid, rewards, rtol=1e-6, atol=1e-9))
     if len(wrong):

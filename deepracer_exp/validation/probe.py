@@ -150,8 +150,8 @@ def never_executed(text: str, lines: set[int]) -> list[tuple[int, int]]:
     spans: list[tuple[int, int]] = []
     for function in ast.walk(ast.parse(text)):
         if isinstance(function, ast.FunctionDef):
-            own = range(function.body[0].lineno, (function.end_lineno or 0) + 1)
-            spans += [] if lines.isdisjoint(own) else _missed(function.body, lines)
+            body = range(function.body[0].lineno, (function.end_lineno or 0) + 1)
+            spans += [] if lines.isdisjoint(body) else _missed(function.body, lines)
     missed: list[tuple[int, int]] = []
     for first, last in sorted(spans):  # functions in classes and in functions are walked last
         if missed and missed[-1][1] >= first - 1:

@@ -46,15 +46,15 @@ class RewardGrid:
     """Rewards at positions spread evenly over the lap."""
 
     speeds_mps: Floats
-    """Slowest, middle and fastest of the action space, (3,)."""
+    """Slowest, middle and fastest speed of the action space, (3,)."""
     headings_rad: Floats
-    """Against the centre line, (H,)."""
+    """Headings relative to the centre line, (H,)."""
     offsets_m: Floats
-    """To the left of the centre line, in ascending order, (W,)."""
+    """Offsets to the left of the centre line, in ascending order, (W,)."""
     reward: Floats
-    """By speed, position, heading and offset, (3, P, H, W)."""
+    """Rewards by speed, position, heading and offset, (3, P, H, W)."""
     off_track: NDArray[np.bool_]
-    """The same shape."""
+    """Whether the car is off the track, in the shape of `reward`."""
     all_speeds_mps: Floats
     """(S,)"""
     steerings_deg: Floats
@@ -83,9 +83,9 @@ def sample_reward_grid(setup: RaceSetup, state: State, detail: float) -> RewardG
     def rewards(*pose: ArrayLike) -> tuple[Floats, NDArray[np.bool_]]:
         """Return the rewards of `situations.poses` and whether they are off the track, both of their shape."""
         shape = np.broadcast_shapes(*map(np.shape, pose))
-        at = poses(setup, *pose)
-        now = situations(setup, at)
-        before = situations(setup, at, earlier=True) if state == "earlier calls" else None
+        where = poses(setup, *pose)
+        now = situations(setup, where)
+        before = situations(setup, where, earlier=True) if state == "earlier calls" else None
         return probe.rewards(now, before).reshape(shape), now.columns["is_offtrack"].reshape(shape)
 
     def points(n: int) -> int:
@@ -134,9 +134,9 @@ def state_of(setup: RaceSetup, probe: Probe, n: int = 40) -> State:
 
     `probe` must not have been called before; it collects the failures.
     """
-    at = sample(setup, n)
-    now = situations(setup, at)
-    before = situations(setup, at, earlier=True)
+    places = sample(setup, n)
+    now = situations(setup, places)
+    before = situations(setup, places, earlier=True)
     alone = probe.rewards(now)
     if probe.failures:
         return "none"
@@ -281,10 +281,13 @@ def _draw_cuts(
 
 
 def _draw_cut(
-    axes: Axes, reward: np.ndarray, at: tuple[np.ndarray, np.ndarray], colors: Colormap, norm: Normalize
+    axes: Axes, reward: np.ndarray, ranges: tuple[np.ndarray, np.ndarray], colors: Colormap, norm: Normalize
 ) -> None:
-    x, y = (np.array([v[0] - 0.5, v[0] + 0.5]) if len(v) == 1 else v for v in at)
-    step_x, step_y = (x[-1] - x[0]) / max(len(at[0]) - 1, 1) / 2, (y[-1] - y[0]) / max(len(at[1]) - 1, 1) / 2
+    x, y = (np.array([v[0] - 0.5, v[0] + 0.5]) if len(v) == 1 else v for v in ranges)
+    step_x, step_y = (
+        (x[-1] - x[0]) / max(len(ranges[0]) - 1, 1) / 2,
+        (y[-1] - y[0]) / max(len(ranges[1]) - 1, 1) / 2,
+    )
     axes.imshow(
         reward,
         extent=(x[0] - step_x, x[-1] + step_x, y[0] - step_y, y[-1] + step_y),

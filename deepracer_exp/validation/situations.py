@@ -92,31 +92,31 @@ def poses(
     )
 
 
-def situations(setup: RaceSetup, at: Poses, earlier: bool = False) -> Situations:
+def situations(setup: RaceSetup, where: Poses, earlier: bool = False) -> Situations:
     """Return the params that the environment's rules compute for poses, or `earlier`, one step before.
 
     Cars have driven straight at the commanded speed since then.
     """
-    n = len(at.ndist)
-    place = setup.track.start_pose(at.ndist)
-    yaw_rad = place.yaw_rad + at.heading_error_rad
-    behind_m = setup.car.front_point_m + at.speed_mps * setup.car.control_period_s * earlier
+    n = len(where.ndist)
+    place = setup.track.start_pose(where.ndist)
+    yaw_rad = place.yaw_rad + where.heading_error_rad
+    behind_m = setup.car.front_point_m + where.speed_mps * setup.car.control_period_s * earlier
     still = np.zeros(n)
     cars = CarState(
-        x_m=place.x - at.offset_m * np.sin(place.yaw_rad) - behind_m * np.cos(yaw_rad),
-        y_m=place.y + at.offset_m * np.cos(place.yaw_rad) - behind_m * np.sin(yaw_rad),
+        x_m=place.x - where.offset_m * np.sin(place.yaw_rad) - behind_m * np.cos(yaw_rad),
+        y_m=place.y + where.offset_m * np.cos(place.yaw_rad) - behind_m * np.sin(yaw_rad),
         yaw_rad=np.mod(yaw_rad + np.pi, 2 * np.pi) - np.pi,
-        speed_mps=at.speed_mps,
+        speed_mps=where.speed_mps,
         lateral_mps=still,
         yaw_rate_radps=still,
     )
-    steps_before = np.maximum(at.steps - 1 - earlier, 0)
+    steps_before = np.maximum(where.steps - 1 - earlier, 0)
     rules = RaceRules(setup, n)
     rules.reset(start_ndist=still)
     rules.measure(cars)
-    rules.start_midway(steps_before, at.progress_before)
+    rules.start_midway(steps_before, where.progress_before)
     rules.clock_steps[:] = steps_before
-    columns = rules.params(rules.apply(), at.steering_deg, at.speed_mps)
+    columns = rules.params(rules.apply(), where.steering_deg, where.speed_mps)
     return Situations(columns, rules.track_params[0])
 
 
@@ -144,8 +144,8 @@ def middle_speed_mps(setup: RaceSetup) -> float:
 
 def start(setup: RaceSetup) -> Situations:
     """Return the first rewarded step of an episode, its second; in the first the car stood on the start line."""
-    at = setup.car.front_point_m / setup.track.length_m
-    return situations(setup, poses(setup, at, 0.0, 0.0, middle_speed_mps(setup), lateness=0.0))
+    front = setup.car.front_point_m / setup.track.length_m
+    return situations(setup, poses(setup, front, 0.0, 0.0, middle_speed_mps(setup), lateness=0.0))
 
 
 def named_situations(setup: RaceSetup, against: Track) -> list[NamedSituation]:
@@ -165,8 +165,8 @@ def named_situations(setup: RaceSetup, against: Track) -> list[NamedSituation]:
     ]
 
 
-def _named(name: str, setup: RaceSetup, at: Poses) -> NamedSituation:
-    return NamedSituation(name, setup, situations(setup, at), situations(setup, at, earlier=True))
+def _named(name: str, setup: RaceSetup, where: Poses) -> NamedSituation:
+    return NamedSituation(name, setup, situations(setup, where), situations(setup, where, earlier=True))
 
 
 def seam(setup: RaceSetup) -> Situations:
@@ -174,10 +174,10 @@ def seam(setup: RaceSetup) -> Situations:
 
     The service returns these two indices there (`bisect_right` past the end); a car hardly ever hits that point.
     """
-    at = situations(setup, poses(setup, 0.5, 0.0, 0.0, middle_speed_mps(setup)))
+    half_way = situations(setup, poses(setup, 0.5, 0.0, 0.0, middle_speed_mps(setup)))
     track = setup.track
     x, y = track.waypoints[-1]
-    return at.given(
+    return half_way.given(
         x=np.array([x]),
         y=np.array([y]),
         projection_distance=np.array([track.length_m]),
@@ -192,9 +192,9 @@ def _off_track(setup: RaceSetup, speed_mps: float) -> Poses:
     away_m, ndist, side = np.meshgrid(
         half_m + np.array([0.2, 0.3, 0.5, 1.0, 2.0]), 0.5 + np.arange(8) / 20, [1.0, -1.0], indexing="ij"
     )
-    at = poses(setup, ndist, side * away_m, 0.0, speed_mps)
-    first = int(np.argmax(situations(setup, at).columns["is_offtrack"]))
-    return Poses(**{name: values[first : first + 1] for name, values in vars(at).items()})
+    where = poses(setup, ndist, side * away_m, 0.0, speed_mps)
+    first = int(np.argmax(situations(setup, where).columns["is_offtrack"]))
+    return Poses(**{name: values[first : first + 1] for name, values in vars(where).items()})
 
 
 def sample(setup: RaceSetup, n: int) -> Poses:

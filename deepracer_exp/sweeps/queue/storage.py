@@ -46,7 +46,7 @@ _DRIVERS = {"psycopg": "psycopg[binary]"}
 """Package of each driver."""
 _CONNECT_S = 10
 _STUCK_S = 60
-"""How long a process may leave a transaction open, or wait for one: a suspended machine must not block others."""
+"""Seconds a process may leave a transaction open, or wait for one: a suspended machine must not block others."""
 _LOCK_NUMBER = 0x64726578
 
 _log = logging.getLogger("deepracer_exp")
@@ -57,7 +57,7 @@ class Database:
     """A database that can hold studies."""
 
     url: sa.URL = field(repr=False)
-    """With its password, if it has one."""
+    """Address, with its password if it has one."""
     shown: str
     """The setting it came from, for messages, without password."""
 

@@ -1,4 +1,4 @@
-"""What a worker process is given, and its name."""
+"""The configuration of a worker process, and its name."""
 
 import socket
 from collections.abc import Mapping
@@ -27,9 +27,9 @@ class WorkerConfig:
     protocol: EvaluationConfig
     space: SearchSpace
     parent: Parent | None
-    """What all trials are clones of; None: they start from scratch."""
+    """The run that all trials are clones of; None if they start from scratch."""
     store: Store | None
-    """Where runs are recorded; None with `tracking=off`."""
+    """The MLflow that records the runs; None with `tracking=off`."""
     study_run_id: str | None
     """MLflow's id of the study's run, None if it has none."""
     evaluations: int | None

@@ -16,7 +16,7 @@ from deepracer_exp.sweeps.trial import SeedRun, Trial
 
 @dataclass(frozen=True, kw_only=True)
 class FreshLaps:
-    """What the best checkpoints of a trial, one per seed, drove on fresh laps."""
+    """Fresh laps of the best checkpoints of a trial, one checkpoint per seed."""
 
     trial: int
     values: list[float]

@@ -53,7 +53,7 @@ _CHARACTER, _LINE = 6.3, 13.0
 _FEWEST_UPRIGHT = 9
 """Characters that must fit below each choice for its name to be written upright; else it is turned."""
 _MOST_POINTS, _FEWEST_POINTS = 15_000, 12
-"""Of all entropy curves together (0.3 MB of the page), and of one curve."""
+"""Most points of all entropy curves together (0.3 MB of the page), and fewest of one curve."""
 
 Target = Callable[[FrozenTrial], float]
 
@@ -73,24 +73,26 @@ def figures(study: optuna.Study) -> dict[str, go.Figure]:
     if complete:
         keys = short_keys(sorted({key for trial in complete for key in trial.params}))
         shown = list(keys)[:_MOST_PARAMETERS]
-        for at, objective in enumerate(objectives):
+        for index, objective in enumerate(objectives):
             several = len(objectives) > 1
             name, title = (f"-{objective}", f": {MEASURES[objective].words}") if several else ("", "")
-            axis = _value_axis(complete, objective, at)
+            axis = _value_axis(complete, objective, index)
             drawn[f"history{name}"] = _history(
-                study, objective, _target(at) if several else None, axis, title
+                study, objective, _target(index) if several else None, axis, title
             )
             if len(complete) >= FEWEST_COMPLETE and len(keys) > 1:
                 # PED-ANOVA considers low values good.
                 sign = 1.0 if MEASURES[objective].minimize else -1.0
-                importance, ranked = _importance(study, keys, _target(at, sign) if several else None, title)
+                importance, ranked = _importance(
+                    study, keys, _target(index, sign) if several else None, title
+                )
                 if importance is not None:
                     drawn[f"importance{name}"] = importance
-                shown = ranked[:_MOST_PARAMETERS] if at == 0 else shown
+                shown = ranked[:_MOST_PARAMETERS] if index == 0 else shown
             if keys:
-                drawn[f"slice{name}"] = _slices(study, shown, keys, _target(at), objective, axis, title)
+                drawn[f"slice{name}"] = _slices(study, shown, keys, _target(index), objective, axis, title)
         for pair in combinations(range(len(objectives)), 2):
-            names = [objectives[at] for at in pair] if len(objectives) > 2 else []
+            names = [objectives[index] for index in pair] if len(objectives) > 2 else []
             drawn["-".join(["pareto", *names])] = _pareto(study, complete, objectives, pair)
         if keys and len(complete) > 1:
             drawn["parallel"] = _parallel(complete, shown, keys, objectives)
@@ -138,8 +140,8 @@ def usual_range(values: Sequence[float], minimize: bool) -> tuple[float, float]:
     return low, high
 
 
-def _target(at: int, sign: float = 1.0) -> Target:
-    return lambda trial: sign * trial.values[at]
+def _target(index: int, sign: float = 1.0) -> Target:
+    return lambda trial: sign * trial.values[index]
 
 
 def _styled(figure: go.Figure, title: str, height: float, *, legend: bool = True) -> go.Figure:
@@ -158,9 +160,9 @@ def _styled(figure: go.Figure, title: str, height: float, *, legend: bool = True
     return figure.update_xaxes(**axes).update_yaxes(**axes)
 
 
-def _value_axis(complete: Sequence[FrozenTrial], objective: str, at: int) -> dict[str, Any]:
+def _value_axis(complete: Sequence[FrozenTrial], objective: str, index: int) -> dict[str, Any]:
     measure = MEASURES[objective]
-    values = [trial.values[at] for trial in complete]
+    values = [trial.values[index] for trial in complete]
     return {"title_text": measure.label, "range": usual_range(values, measure.minimize)}
 
 
@@ -174,8 +176,8 @@ def _arrange(figure: go.Figure, panels: Sequence[str], columns: int) -> float:
     """Arrange panels in a grid; return its height, pixels."""
     gap = _label_height(figure)
     body = math.ceil(len(panels) / columns) * (_PANEL + gap) - gap
-    for at, number in enumerate(panels):
-        row, column = divmod(at, columns)
+    for index, number in enumerate(panels):
+        row, column = divmod(index, columns)
         top = 1 - row * (_PANEL + gap) / body
         domain = column / columns + 0.03 * (column > 0), (column + 1) / columns - 0.01 * (columns > 1)
         rows = {"domain": (max(0.0, top - _PANEL / body), top), "showticklabels": column == 0}
@@ -197,7 +199,7 @@ def _label_choices(axis: go.layout.XAxis, panel_width: float) -> None:
     choices = [value.strip("'") for value in axis.categoryarray]
     width = int(panel_width / len(choices) / _CHARACTER)
     upright = width >= min(_FEWEST_UPRIGHT, max(map(len, choices)))
-    texts = [wrapped(one, width) if upright else _plain(one, _LONGEST_CHOICE) for one in choices]
+    texts = [wrapped(choice, width) if upright else _plain(choice, _LONGEST_CHOICE) for choice in choices]
     axis.update(range=[-0.5, len(choices) - 0.5], tickvals=axis.categoryarray, ticktext=texts)
     axis.update(tickangle=0 if upright else -90)
 
@@ -244,10 +246,10 @@ def _history(
 def _pareto(
     study: optuna.Study, complete: Sequence[FrozenTrial], objectives: Sequence[str], pair: tuple[int, int]
 ) -> go.Figure:
-    names = [objectives[at] for at in pair]
+    names = [objectives[index] for index in pair]
     figure = plot_pareto_front(
         study,
-        targets=lambda trial: [trial.values[at] for at in pair],
+        targets=lambda trial: [trial.values[index] for index in pair],
         target_names=[MEASURES[name].label for name in names],
     )
     _styled(figure, "Pareto front: no other trial is better in every objective", 480)
@@ -288,10 +290,10 @@ def _slices(
     figure.update_xaxes(tickangle=0, nticks=4, exponentformat="power", title_standoff=6, tickfont_size=11)
     figure.for_each_xaxis(lambda axis: _label_choices(axis, _PANEL_WIDTH), {"type": "category"})
     for trace in figure.data:
-        at = figure.layout[f"xaxis{(trace.xaxis or 'x')[1:]}"]
-        if at.type == "log":
-            at.update(_decades(trace.x))
-    figure.for_each_xaxis(lambda one: one.title.update(text=_plain(keys[one.title.text], 40)))
+        x_axis = figure.layout[f"xaxis{(trace.xaxis or 'x')[1:]}"]
+        if x_axis.type == "log":
+            x_axis.update(_decades(trace.x))
+    figure.for_each_xaxis(lambda each: each.title.update(text=_plain(keys[each.title.text], 40)))
     body = _arrange(figure, panels, min(_COLUMNS, len(panels)))
     figure.update_layout(
         height=round(body + 60 + _label_height(figure)), margin={"r": 90, "b": _label_height(figure)}
@@ -307,9 +309,9 @@ def _parallel(
 ) -> go.Figure:
     """Draw every complete trial as a line through its parameters, coloured by its first objective."""
     axes = []
-    for at, objective in enumerate(objectives):
-        low, high = _value_axis(complete, objective, at)["range"]
-        values = [_short(min(max(trial.values[at], low), high)) for trial in complete]
+    for index, objective in enumerate(objectives):
+        low, high = _value_axis(complete, objective, index)["range"]
+        values = [_short(min(max(trial.values[index], low), high)) for trial in complete]
         axes.append({"label": MEASURES[objective].label, "values": values, "range": (low, high)})
     axes += [_parameter_axis(key, keys[key], complete) for key in shown]
     crowded = len(axes) > 7
@@ -338,16 +340,16 @@ def _parameter_axis(key: str, label: str, trials: Sequence[FrozenTrial]) -> dict
     lacking = [NONE] * (None in params)
     axis: dict[str, Any] = {"label": _plain(label, 40)}
     if isinstance(distribution, CategoricalDistribution):
-        choices = [one for one in distribution.choices if one in params]
-        ticks = lacking + [_plain(one, _LONGEST_CHOICE) for one in choices]
-        places = [0 if one is None else len(lacking) + choices.index(one) for one in params]
+        choices = [choice for choice in distribution.choices if choice in params]
+        ticks = lacking + [_plain(choice, _LONGEST_CHOICE) for choice in choices]
+        places = [0 if value is None else len(lacking) + choices.index(value) for value in params]
         return axis | {"values": places, "tickvals": list(range(len(ticks))), "ticktext": ticks}
     scale: Callable[[float], float] = math.log10 if distribution.log else float
     low, high = scale(distribution.low), scale(distribution.high)
     ends = [low + part * (high - low) / 4 for part in range(5)]
     texts = [parameter(10**end if distribution.log else end) for end in ends]
     below = low - 0.12 * (high - low or 1.0)
-    axis["values"] = [below if one is None else _short(scale(one)) for one in params]
+    axis["values"] = [below if value is None else _short(scale(value)) for value in params]
     top = high if high > low else low + 1.0
     if lacking:
         return axis | {"range": (below, top), "tickvals": [below, *ends], "ticktext": [NONE, *texts]}
@@ -361,10 +363,10 @@ def _entropy_curves(study: optuna.Study, trials: Sequence[FrozenTrial]) -> go.Fi
         return None
     every = [row for runs in rows.values() for run in runs for row in run]
     column = "entropy_share" if any(row.get("entropy_share") is not None for row in every) else "entropy"
-    known = [trial for trial in trials if trial.number in rows]
+    drawn = [trial for trial in trials if trial.number in rows]
     figure = go.Figure()
     for ending, style in ENDINGS.items():
-        numbers = [trial.number for trial in known if ending_of(trial) == ending]
+        numbers = [trial.number for trial in drawn if ending_of(trial) == ending]
         if numbers:
             some = {number: rows[number] for number in numbers}
             line = {"color": style.color, "dash": style.dash, "width": 1.3}
@@ -391,8 +393,8 @@ def _curves(rows: Mapping[int, list[list[dict[str, Any]]]], column: str, most: i
     numbers: list[int] = []
     for number, runs in rows.items():
         for run in runs:
-            known = [row for row in run if row.get(column) is not None and math.isfinite(row[column])]
-            some = thinned(known, most)
+            measured = [row for row in run if row.get(column) is not None and math.isfinite(row[column])]
+            some = thinned(measured, most)
             x += [*(int(row["env_steps"]) for row in some), None]
             y += [*(round(row[column], 4) for row in some), None]
             numbers += [number] * (len(some) + 1)
@@ -403,22 +405,22 @@ def _curves(rows: Mapping[int, list[list[dict[str, Any]]]], column: str, most: i
 def _rows(study: optuna.Study, trial: FrozenTrial) -> list[list[dict[str, Any]]]:
     """Return the rows of a trial's runs, without runs whose files are gone or incomplete."""
     base = Path(study.user_attrs.get("runs_dir", "runs")) / study.study_name
-    found = []
+    by_run = []
     for run in Trial.of(trial).runs:
         try:
             rows = read_metrics(run.folder(base) / METRICS)
         except BadInput:
             continue
         if rows := [row for row in rows if isinstance(row.get("env_steps"), int)]:
-            found.append(rows)
-    return found
+            by_run.append(rows)
+    return by_run
 
 
 def thinned(rows: Sequence[Any], most: int) -> list[Any]:
     """Return at most `most` rows at even distances, the first and the last among them."""
     if len(rows) <= most:
         return list(rows)
-    return [rows[round(at * (len(rows) - 1) / (most - 1))] for at in range(most)]
+    return [rows[round(k * (len(rows) - 1) / (most - 1))] for k in range(most)]
 
 
 def _plain(text: object, longest: int = 90) -> str:

@@ -9,7 +9,7 @@ from deepracer_exp.sweeps.trial import Trial
 
 
 class EndingStyle(NamedTuple):
-    """How trials with the same ending are drawn."""
+    """Colour and dash of trials with the same ending."""
 
     color: str
     dash: str
@@ -33,7 +33,7 @@ ENDINGS: Mapping[str, EndingStyle] = {
     "failed": EndingStyle("#000000", "longdashdot", "ended by an error"),
     "running": EndingStyle("#9A9A9A", "dot", "still running"),
 }
-"""By `Trial.ending`. Colours after Okabe and Ito (jfly.uni-koeln.de/color); the others differ from
+"""Styles by `Trial.ending`. Colours after Okabe and Ito (jfly.uni-koeln.de/color); the others differ from
 them for colour-blind readers, too, or are drawn with another dash."""
 
 _BY_STATE = {TrialState.COMPLETE: "finished", TrialState.PRUNED: "pruned", TrialState.FAIL: "failed"}
@@ -55,12 +55,14 @@ def ending_words(ending: str) -> str:
 def short_keys(keys: Iterable[str]) -> dict[str, str]:
     """Return for each dotted key its last part, or as many last parts as distinguish it from the other keys."""
     parts = {key: key.split(".") for key in keys}
-    found: dict[str, str] = {}
-    for key, own in parts.items():
+    short: dict[str, str] = {}
+    for key, words in parts.items():
         others = [other for name, other in parts.items() if name != key]
-        length = next((n for n in range(1, len(own)) if all(o[-n:] != own[-n:] for o in others)), len(own))
-        found[key] = ".".join(own[-length:])
-    return found
+        length = next(
+            (n for n in range(1, len(words)) if all(o[-n:] != words[-n:] for o in others)), len(words)
+        )
+        short[key] = ".".join(words[-length:])
+    return short
 
 
 def parameter(value: Any) -> str:

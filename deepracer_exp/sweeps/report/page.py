@@ -110,7 +110,7 @@ def _winner(study: optuna.Study, keys: dict[str, str]) -> list[tuple[str, str]]:
     """Return the winner's parameters and results, as names and values."""
     best = best_trial(study)
     results = Trial.of(best)
-    found = [
+    lines = [
         *((keys[key], parameter(value)) for key, value in best.params.items()),
         ("Mean usual lap", shown_or_dash("lap_time", results.lap_time_s)),
         ("Usual completion", shown_or_dash("completion", results.completion)),
@@ -119,11 +119,11 @@ def _winner(study: optuna.Study, keys: dict[str, str]) -> list[tuple[str, str]]:
     try:
         run = read_head(best_run(study))
     except BadInput:  # moved or removed since
-        return found
-    known = {name.lower() for name, _ in found}
+        return lines
+    shown = {name.lower() for name, _ in lines}
     return [
-        pair for pair in run_outcome(run) if pair[0] in ("Track", "Reward") and pair[0].lower() not in known
-    ] + found
+        pair for pair in run_outcome(run) if pair[0] in ("Track", "Reward") and pair[0].lower() not in shown
+    ] + lines
 
 
 def _next_steps(study: optuna.Study) -> list[tuple[str, str]]:
@@ -158,10 +158,10 @@ def _picture(study: optuna.Study) -> str | None:
 
 def endings(trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
     """Return for each ending its trials and control steps, with their shares in per cent."""
-    spent, found = _spent(trials), []
+    spent, counted = _spent(trials), []
     for ending, style in ENDINGS.items():
         if some := [trial for trial in trials if ending_of(trial) == ending]:
-            found.append(
+            counted.append(
                 {
                     "ending": ending_words(ending),
                     "color": style.color,
@@ -172,7 +172,7 @@ def endings(trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
                     "steps_share": 100 * _spent(some) / spent if spent else 0.0,
                 }
             )
-    return found
+    return counted
 
 
 def _spent(trials: Sequence[FrozenTrial]) -> int:
@@ -182,11 +182,11 @@ def _spent(trials: Sequence[FrozenTrial]) -> int:
 def _winners(study: optuna.Study, objectives: Sequence[str], keys: dict[str, str]) -> list[dict[str, Any]]:
     """Return the re-ranked trials, the best on fresh laps first."""
     by_number = {trial.number: trial for trial in complete_trials(study)}
-    found = []
+    tables = []
     for laps in reranked(study):
         trial = by_number[laps.trial]
         params = ", ".join(f"{keys[key]} {parameter(value)}" for key, value in trial.params.items())
-        found.append(
+        tables.append(
             {
                 "trial": trial.number,
                 "now": shown_values(objectives, laps.values),
@@ -198,13 +198,13 @@ def _winners(study: optuna.Study, objectives: Sequence[str], keys: dict[str, str
                 "parameters": params,
             }
         )
-    return found
+    return tables
 
 
 def _table(study: optuna.Study, objectives: Sequence[str], keys: dict[str, str]) -> dict[str, Any]:
     """Return the table of trials: complete ones, the best first, then running, pruned and failed ones."""
     trials = study.get_trials(deepcopy=False)
-    rank = {trial.number: at for at, trial in enumerate(complete_trials(study))}
+    rank = {trial.number: place for place, trial in enumerate(complete_trials(study))}
     order = sorted(trials, key=lambda t: (_ORDER.index(t.state), rank.get(t.number, t.number)))
     columns = list(keys)[:_MOST_PARAMETERS]
     extra = [
@@ -215,7 +215,7 @@ def _table(study: optuna.Study, objectives: Sequence[str], keys: dict[str, str])
     rows = []
     for trial in order[:_MOST_ROWS]:
         results, ending = Trial.of(trial), ending_of(trial)
-        values = [shown_or_dash(name, _value(trial, at)) for at, name in enumerate(objectives)]
+        values = [shown_or_dash(name, _value(trial, index)) for index, name in enumerate(objectives)]
         values += [shown_or_dash(objective, getattr(results, attr)) for attr, objective in extra]
         values.append(shown_or_dash("completion", results.held_out_completion))
         reason = results.reason
@@ -241,10 +241,10 @@ def _table(study: optuna.Study, objectives: Sequence[str], keys: dict[str, str])
     }
 
 
-def _value(trial: FrozenTrial, at: int) -> float | None:
+def _value(trial: FrozenTrial, index: int) -> float | None:
     """Return a trial's value of one objective, of a pruned one the last it had; None if it has none."""
     if trial.state == TrialState.COMPLETE:
-        return trial.values[at]
+        return trial.values[index]
     if trial.state == TrialState.PRUNED and trial.last_step is not None:
         return trial.intermediate_values[trial.last_step]
     return None
@@ -256,7 +256,7 @@ def _failures(trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
     for trial in trials:
         if trial.state == TrialState.FAIL:
             groups.setdefault(Trial.of(trial).reason or "no reason stored", []).append(trial)
-    found: list[dict[str, Any]] = [
+    failures: list[dict[str, Any]] = [
         {
             "reason": reason,
             "numbers": ", ".join(str(trial.number) for trial in some[:12]) + ", …" * (len(some) > 12),
@@ -265,7 +265,7 @@ def _failures(trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
         }
         for reason, some in groups.items()
     ]
-    return sorted(found, key=lambda one: one["count"], reverse=True)[:_MOST_FAILURES]
+    return sorted(failures, key=lambda failure: failure["count"], reverse=True)[:_MOST_FAILURES]
 
 
 def _facts(study: optuna.Study, objectives: Sequence[str]) -> list[tuple[str, str]]:

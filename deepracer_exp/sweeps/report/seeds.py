@@ -25,18 +25,18 @@ def over_seeds(study: optuna.Study, keys: dict[str, str]) -> list[dict[str, Any]
         keys: short names of the parameters.
     """
     objective = objectives_of(study)[0]
-    known = [(trial, values) for trial in complete_trials(study) if len(values := _values(trial)) > 1]
-    if not known:
+    repeated = [(trial, values) for trial in complete_trials(study) if len(values := _values(trial)) > 1]
+    if not repeated:
         return []
     best = best_trial(study)
-    found = []
-    for trial, values in known[:_MOST_ROWS]:
-        own = estimate([values])
+    rows = []
+    for trial, values in repeated[:_MOST_ROWS]:
+        score = estimate([values])
         row = {
             "trial": trial.number,
-            "seeds": own.seeds,
-            "iqm": shown(objective, own.iqm),
-            "interval": _ends(objective, own.interval),
+            "seeds": score.seeds,
+            "iqm": shown(objective, score.iqm),
+            "interval": _ends(objective, score.interval),
             "difference": NONE,
             "probability": NONE,
             "verdict": "the best" if trial.number == best.number else NONE,
@@ -49,8 +49,8 @@ def over_seeds(study: optuna.Study, keys: dict[str, str]) -> list[dict[str, Any]
                 "probability": f"{apart.probability:.0%}",
                 "verdict": apart.verdict(),
             }
-        found.append(row)
-    return found
+        rows.append(row)
+    return rows
 
 
 def _values(trial: FrozenTrial) -> Values:

@@ -59,13 +59,13 @@ class SweepView:
 
     def show(self, claims: Sequence[Claim], stage: str = "") -> None:
         """Draw the present state of all claims; `stage` says what happens while no trial runs."""
-        ended = {one.trial.number for one in claims if one.has_ended}
+        ended = {claim.trial.number for claim in claims if claim.has_ended}
         if self._made_before is None:
             self._made_before, self._printed = _made(claims), set(ended)
-        for one in claims:
-            self._follow(one)
-            if self._live is None and one.trial.number in ended - self._printed:
-                line = _sentence(one, self._sweep.objectives)
+        for claim in claims:
+            self._follow(claim)
+            if self._live is None and claim.trial.number in ended - self._printed:
+                line = _sentence(claim, self._sweep.objectives)
                 self._line(f"{line}; {len(ended)} of {self._sweep.trials}, {self._left(claims)}")
         self._printed |= ended
         if self._live is not None:
@@ -84,7 +84,7 @@ class SweepView:
 
     def _panel(self, claims: Sequence[Claim], stage: str) -> Panel:
         parts: list[Any] = [self._summary(claims)]
-        running = [one for one in claims if not one.has_ended]
+        running = [claim for claim in claims if not claim.has_ended]
         if running:
             parts += [Text(), self._running(running)]
         if stage or not claims:
@@ -93,8 +93,8 @@ class SweepView:
 
     def _summary(self, claims: Sequence[Claim]) -> Table:
         total = self._sweep.trials
-        counts = collections.Counter(one.trial.state for one in claims if one.has_ended)
-        words = ", ".join(f"{counts[one]} {word}" for one, word in _STATES.items())
+        counts = collections.Counter(claim.trial.state for claim in claims if claim.has_ended)
+        words = ", ".join(f"{counts[state]} {word}" for state, word in _STATES.items())
         grid = Table.grid("", "", padding=(0, 2))
         grid.add_row("trials", ProgressBar(total, min(counts.total(), total), width=40))
         grid.add_row("", f"{counts.total()} of {total}: {words}")
@@ -141,7 +141,7 @@ class SweepView:
 
 
 def _made(claims: Sequence[Claim]) -> float:
-    return sum(1.0 if one.has_ended else one.progress.get("share", 0.0) for one in claims)
+    return sum(1.0 if claim.has_ended else claim.progress.get("share", 0.0) for claim in claims)
 
 
 def _params(claim: Claim) -> str:

@@ -44,8 +44,8 @@ MEASURES: Mapping[str, Measure] = {
     "completion": Measure("Usual completion", "%", minimize=False),
     "zigzag": Measure("Zig-zag", "changes/m", minimize=True),
 }
-"""By the name of the objective. Race score: seconds per complete lap, failed laps included; usual and held-out are
-conditions. Zig-zag: changes of steering from one side to the other a metre of straight."""
+"""Measures by the name of the objective. Race score: seconds per complete lap, failed laps included; usual and held-out
+are conditions. Zig-zag: changes of steering from one side to the other a metre of straight."""
 
 
 def objectives_of(study: optuna.Study) -> tuple[str, ...]:
@@ -100,7 +100,7 @@ def objective_values(evaluation: "Evaluation", objectives: Sequence[str], trial_
             usual.zigzag.changes_per_m, usual.completion, usual.mean_lap_time_s is not None
         ),
     }
-    return [fallback if values[one] is None else float(values[one] or 0.0) for one in objectives]
+    return [fallback if values[name] is None else float(values[name] or 0.0) for name in objectives]
 
 
 def without_lap(completion: float, trial_time_s: float) -> float:

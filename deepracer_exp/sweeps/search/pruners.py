@@ -73,7 +73,7 @@ def build_pruner(config: SweepConfig, evaluations: int | None = None) -> FirstOf
     """
     startup, first = config.startup_trials, config.warmup_evaluations + 1
     longest = "auto" if evaluations is None else max(evaluations, first)
-    known: dict[str, tuple[BasePruner, str]] = {
+    pruners: dict[str, tuple[BasePruner, str]] = {
         "median": (MedianPruner(startup, n_warmup_steps=first), "better half"),
         "percentile": (
             PercentilePruner(config.percentile, startup, n_warmup_steps=first),
@@ -81,7 +81,7 @@ def build_pruner(config: SweepConfig, evaluations: int | None = None) -> FirstOf
         ),
         "hyperband": (HyperbandPruner(first, longest, reduction_factor=3), "best third"),
     }
-    chosen = {name: known[name] for name in map(str, config.pruners) if name in known}
+    chosen = {name: pruners[name] for name in map(str, config.pruners) if name in pruners}
     if chosen and len(config.objectives) > 1:
         raise BadInput(
             f"sweep.pruners=[{','.join(config.pruners)}]: {', '.join(chosen)} compare one score, and "

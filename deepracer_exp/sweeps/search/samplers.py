@@ -142,8 +142,8 @@ class _WithPruned(Study):
     def _get_trials(
         self, deepcopy: bool = True, states: Container[TrialState] | None = None, use_cache: bool = False
     ) -> list[FrozenTrial]:
-        found = [_as_complete(trial) for trial in super()._get_trials(deepcopy, None, use_cache)]
-        return [trial for trial in found if states is None or trial.state in states]
+        trials = [_as_complete(trial) for trial in super()._get_trials(deepcopy, None, use_cache)]
+        return [trial for trial in trials if states is None or trial.state in states]
 
 
 def _as_complete(trial: FrozenTrial) -> FrozenTrial:
@@ -179,7 +179,7 @@ _SAMPLERS: dict[str, Callable[[SweepConfig, SearchSpace, int, int], BaseSampler]
     "grid": lambda config, space, number, seed: _EndlessGrid(dict(space.grid()), seed=config.seed),
     "random": lambda config, space, number, seed: RandomSampler(seed=seed),
 }
-"""By name, from (sweep, space, number of the trial, seed of the trial)."""
+"""Samplers by name, from (sweep, space, number of the trial, seed of the trial)."""
 
 
 def _distributions(space: SearchSpace) -> dict[str, BaseDistribution]:
@@ -193,7 +193,9 @@ def _check_cmaes(config: SweepConfig, space: SearchSpace) -> None:
             f"sweep.sampler=cmaes: follows one objective, and sweep.objectives has {len(config.objectives)}; "
             f"accepted with several: {others}"
         )
-    if all(isinstance(found, CategoricalDistribution) for found in _distributions(space).values()):
+    if all(
+        isinstance(distribution, CategoricalDistribution) for distribution in _distributions(space).values()
+    ):
         raise BadInput(
             "sweep.sampler=cmaes",
             f"searches ranges, and the space has choices only; accepted for them: {others}",
