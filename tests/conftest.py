@@ -27,6 +27,7 @@ from deepracer_exp.cli import main
 from deepracer_exp.errors import BadInput
 
 from .browser import chromium, tab
+from .compositions import compose_once
 from .postgres import postgres, postgres_server
 from .waiting import PATIENCE_S
 
@@ -37,6 +38,8 @@ __all__ = ["chromium", "postgres", "postgres_server", "tab"]
 settings.register_profile("same", deadline=None, derandomize=True)
 settings.register_profile("new", deadline=None, print_blob=True)
 settings.load_profile("same")
+
+compose_once()
 
 # A job that a script starts in the background ignores Ctrl-C, and so would the processes that the tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)

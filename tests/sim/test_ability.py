@@ -1,11 +1,12 @@
 import numpy as np
 import pytest
 
-from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.car import CarConfig
+from deepracer_exp.config.compose import compose_option
 from deepracer_exp.sim.ability import ability_of
 from deepracer_exp.sim.batch import CarBatch
 
-CAR = compose_experiment(["car=deepracer"])[0].car
+CAR = compose_option("car", "deepracer", CarConfig)
 LOW, HIGH = np.array([0.1, -np.deg2rad(30)]), np.array([4.0, np.deg2rad(30)])
 
 

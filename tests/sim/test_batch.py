@@ -5,12 +5,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.car import CarConfig
+from deepracer_exp.config.compose import compose_option
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.sim.batch import CarBatch
 
 VERSIONS = ("deepracer_v4", "deepracer_v5", "deepracer_v6")
-CARS = {name: compose_experiment([f"car={name}"])[0].car for name in (*VERSIONS, "ideal")}
+CARS = {name: compose_option("car", name, CarConfig) for name in (*VERSIONS, "ideal")}
 CAR, IDEAL = CARS["deepracer_v5"], CARS["ideal"]
 EVEN = dataclasses.replace(CAR, steering_trim_deg=0.0)
 STILL = dataclasses.replace(CAR, min_speed_mps=0.0)
