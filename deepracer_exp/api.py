@@ -31,7 +31,7 @@ class ComposedExperiment:
     """An experiment, validated, and where its values come from."""
 
     config: Experiment
-    """Its values, as attributes: `config.algorithm.lr`."""
+    """Values as attributes: `config.algorithm.lr`."""
     composition: Composition
 
     def yaml(self) -> str:

@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 Content = TypeVar("Content")
 
 SETTINGS_BYTES = 2**20
-"""Of a hand-written file: YAML, JSON, a reward function. None comes near it; a larger file is something else."""
+"""Limit for a hand-written file: YAML, JSON, a reward function. None comes near it; a larger file is something else."""
 ROUTE_BYTES = 2**21
-"""Of a route: more than 40,000 rows, a hundred times the longest of the service."""
+"""Limit for a route: more than 40,000 rows, a hundred times the longest of the service."""
 RECORD_BYTES = 2**30
-"""Of a file that a training writes; metrics.jsonl has about 1 KB an iteration."""
+"""Limit for a file that a training writes; metrics.jsonl has about 1 KB an iteration."""
 LOG_BYTES = 2**32
-"""Of a log or an archive, and of a file packed in it; the largest known logs have hundreds of megabytes."""
+"""Limit for a log or an archive, and for a file packed in it; the largest known logs have hundreds of megabytes."""
 
 _MOST_VALUES = 100_000
 _DEEPEST = 50

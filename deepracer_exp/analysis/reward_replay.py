@@ -47,7 +47,7 @@ class ReplayedRewards:
     """Rewards of a view's course under another reward function."""
 
     reward: str
-    """Its name."""
+    """Name of the function."""
     course: Track
     steps: pd.DataFrame
     """All steps on the course and `new_reward`; NaN where the params could not be rebuilt."""

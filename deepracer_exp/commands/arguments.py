@@ -116,7 +116,7 @@ class Stores:
     uri: str | None
     """MLflow store; None: the one in `runs_dir`."""
     values: dict[str, str]
-    """Of the other keys that the command takes."""
+    """Values of the other keys that the command takes."""
 
     def find(self, run: str) -> "StoredRun":
         """Find a run; arguments and errors as for `lookup.resolve.resolve`."""

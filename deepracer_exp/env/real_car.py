@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 CAR_PICTURE = (160, 120)
 """Width and height of what the car's software shows a model."""
 FRAME_SCALE = 4
-"""Its camera's frames are this many times as wide and high."""
+"""Width and height of the camera's frames over those of the picture."""
 
 
 def car_refusals(experiment: Experiment) -> list[str]:

@@ -39,7 +39,7 @@ Floats = NDArray[np.float64]
 ALGORITHM = 3
 """Laps that an earlier version found are searched again."""
 COLUMNS = ("time_s", "x_m", "y_m", "yaw_rad", "speed_mps", "progress", "steering_deg", "commanded_mps")
-"""Of a lap's steps: clock, front of the car, heading, speed, per cent of the lap, and the command given there."""
+"""Columns of a lap's steps: clock, front point, heading, speed, per cent of the lap, and the command given there."""
 _TRACED = ("tstamp", "X", "Y", "yaw", "speed_mps", "progress", "steer", "throttle")
 _LINE_M = 0.1
 
@@ -53,7 +53,7 @@ class FastestLap:
     bound_s: float
     """No lap of this kind is faster, as far as a search over lines tells (`tracks.line_time`)."""
     steps: Floats
-    """Its control steps, the prepare step first, (n, `COLUMNS`)."""
+    """Control steps of the lap, the prepare step first, (n, `COLUMNS`)."""
 
     def column(self, name: str) -> Floats:
         """Return one of `COLUMNS`, (n,)."""

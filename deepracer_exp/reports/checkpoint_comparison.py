@@ -52,7 +52,7 @@ class LapStatistics:
     complete: float
     """Complete laps per lap tried on the usual conditions, per cent."""
     low: float
-    """Its interval by bootstrap over the trials; the share itself where there is none."""
+    """Interval of the share by bootstrap over the trials; the share itself where there is none."""
     high: float
     completion: float
     """Per cent of the lap, mean over the laps tried on the usual conditions."""

@@ -35,7 +35,7 @@ class Plot:
     least_width: int
     """Pixels below which it scrolls sideways; 0: it gets as narrow as the page."""
     packed: str
-    """Its JSON, gzip in base64."""
+    """The figure's JSON, gzip in base64."""
 
 
 @dataclass(frozen=True)

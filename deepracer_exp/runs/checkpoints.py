@@ -48,7 +48,7 @@ class StoredPolicy:
 
     networks: ActorCritic
     path: Path
-    """Its own folder, not a link to it."""
+    """The checkpoint's folder itself, not a link to it."""
     counters: dict[str, Any]
     """Iteration, env steps and the like at which it was saved."""
 

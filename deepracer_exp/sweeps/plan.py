@@ -21,7 +21,7 @@ class SweepPlan:
 
     request: SweepRequest
     overrides: Sequence[str]
-    """Those of the request: what the study was begun with comes before what only names it."""
+    """Overrides of the request: what the study was begun with comes before what only names it."""
     study: "Study | None"
     """The study that is continued; None: it is begun."""
     remarks: tuple[str, ...]

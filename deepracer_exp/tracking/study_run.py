@@ -45,7 +45,7 @@ class Progress:
     best_values: Mapping[str, float] = field(default_factory=dict)
     """Values of the best trial by objective."""
     best_shown: str | None = None
-    """These values in words: ``race score 9.84 s``."""
+    """Values of the best trial in words: ``race score 9.84 s``."""
     best_line: str | None = None
     """The command that trains the best trial."""
     lap_time_s: float | None = None

@@ -37,7 +37,7 @@ class DrivenLap:
     """Commanded on straights; less in bends."""
     time_s: float
     paid: Situations
-    """Its rewarded steps."""
+    """Rewarded steps of the lap."""
 
 
 def action_space_laps(setup: RaceSetup) -> list[DrivenLap]:

@@ -98,9 +98,9 @@ class Check:
 
     setup: RaceSetup
     against: Track
-    """The same track, driven the other way."""
+    """The track driven the other way."""
     discount: float
-    """Of the experiment, per control step."""
+    """Discount of the experiment per control step."""
     aws: list[AwsFinding]
     """Reasons why deepracer-on-aws would refuse the function."""
     tried: dict[str, Answer] = field(default_factory=dict)

@@ -74,7 +74,7 @@ class LogFile:
 
     @property
     def name(self) -> str:
-        """Its own name."""
+        """Name of the file itself."""
         return self.parts[-1]
 
     @property

@@ -57,7 +57,7 @@ class LocalWorker:
         assert started.pid is not None
         self._process = started
         self.owner: str | None = owner_name(started.pid, token)
-        """Its name in the trial claims; None while it waits for room on a cluster."""
+        """Name of the worker in the trial claims; None while it waits for room on a cluster."""
 
     @property
     def exitcode(self) -> int | None:
