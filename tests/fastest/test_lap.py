@@ -108,6 +108,18 @@ def test_an_open_course_is_driven_to_its_end(cache):
     assert found.column("progress")[-1] == 100.0
 
 
+def test_a_lap_through_tight_bends_is_near_its_bound(cache):
+    # Searched once and at a single speed of the guesses, a lap of this course is a third above its bound.
+    x = np.linspace(0.0, 6.0, 121)
+    centre = np.column_stack([x, 1.25 * (1.0 - np.cos(0.5 * np.pi * x))])
+    ahead = np.gradient(centre, axis=0)
+    left = np.column_stack([-ahead[:, 1], ahead[:, 0]]) / np.hypot(*ahead.T)[:, None]
+    rows = np.concatenate([centre, centre + 0.4 * left, centre - 0.4 * left], axis=1)
+    found = fastest_lap(question(track=Track.from_route(rows, "bends")))
+    assert found.over_bound < 0.1
+    assert found.column("progress")[-1] == 100.0
+
+
 def test_limits_that_no_lap_fits_into_are_said_in_one_line(cache):
     with pytest.raises(RunFailed, match="ring: no lap was found that stays on the road with"):
         fastest_lap(question("action_space.steering_angle.low=-3", "action_space.steering_angle.high=3"))
