@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 
-from deepracer_exp.lookup.resolve import folder_of, resolve
+from deepracer_exp.lookup.resolve import resolve
 from deepracer_exp.tracking.store import is_run_id
 from tests.conftest import refused
 
@@ -187,7 +187,7 @@ def test_an_id_leads_to_the_folder_until_the_run_is_deleted(season, client, tmp_
     run = season.run("one")
     run_id, foreign = season.recorded(run, client), client.create_run("0").info.run_id
     assert is_run_id(run_id)
-    assert folder_of(run_id, None, season.runs_dir) == run
+    assert resolve(run_id, season.runs_dir, None).path == run
     client.delete_run(run_id)
     (tmp_path / "empty").mkdir()
     for given, runs_dir, words in (
@@ -196,5 +196,5 @@ def test_an_id_leads_to_the_folder_until_the_run_is_deleted(season, client, tmp_
         (foreign, season.runs_dir, "not a run of deepracer-exp"),
         (run_id, tmp_path / "empty", "no mlflow.db"),
     ):
-        assert words in refused(folder_of, given, None, runs_dir)
+        assert words in refused(resolve, given, runs_dir, None)
     assert not list((tmp_path / "empty").iterdir())
