@@ -273,9 +273,10 @@ def test_time_in_which_the_whole_process_was_stopped_does_not_count() -> None:
     ],
 )
 def test_what_would_keep_the_command_from_ending_is_refused(body: str, name: str) -> None:
+    before = threading.active_count()  # what other tests of this process left, such as a thread of MLflow
     error = failure(function(body))
     assert f"reward_function called {name}, which a reward function must not in line 2" in str(error)
-    assert threading.active_count() == 1
+    assert threading.active_count() <= before
 
 
 @pytest.mark.parametrize(
