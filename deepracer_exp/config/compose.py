@@ -218,6 +218,8 @@ def _check_names(evaluation: EvaluationConfig) -> None:
     for key in ("usual", "held_out"):
         if (name := getattr(evaluation, key)) is not None:
             check_option("randomization", name, f"evaluation.{key}")
+    if evaluation.race is not None:
+        check_option("race", evaluation.race, "evaluation.race")
 
 
 def expand_grid(overrides: Sequence[str]) -> list[list[str]]:

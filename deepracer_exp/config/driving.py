@@ -128,6 +128,8 @@ class ObservationConfig:
     speed_scale_mps: Divisor
     yaw_rate_scale_radps: Divisor
     parts: tuple[OwnClass, ...] = ()
+    next_objects: Annotated[int, Field(ge=0, le=20)] = 0
+    next_objects_reach_m: Divisor = 5.0
     camera: CameraConfig | None = None
     lidar: LidarConfig | None = None
 

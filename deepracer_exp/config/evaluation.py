@@ -20,6 +20,7 @@ class PenaltyConfig:
     off_track: NonNegative
     reversed: NonNegative
     immobilized: NonNegative
+    crashed: NonNegative = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +71,7 @@ class EvaluationConfig:
     held_out: str | None
     sample: bool
     seed: Annotated[int, Field(ge=0, lt=2**31)]
+    race: str | None = None
     real_car: RealCarConfig | None = None
 
 

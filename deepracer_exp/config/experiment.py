@@ -10,6 +10,7 @@ from .car import CarConfig
 from .driving import ActionSpaceConfig, EpisodeConfig, ObservationConfig, RandomizationConfig, RewardConfig
 from .evaluation import EvaluationConfig
 from .learning import AlgorithmConfig, CNNConfig, LRScheduleConfig, MLPConfig, NetworkConfig
+from .race import ALONE, RaceConfig
 from .running import BudgetConfig, CheckpointsConfig, CollectorConfig, TrackingConfig
 from .stopping import StoppingConfig
 from .track import TrackConfig, Tracks
@@ -63,6 +64,7 @@ class Experiment:
     budget: BudgetConfig
     tracking: TrackingConfig
     teacher: Annotated[str, Field(min_length=1)] | None = None
+    race: RaceConfig = ALONE
     device: Annotated[str, AfterValidator(_device)] = "cpu"
 
     def __post_init__(self) -> None:
@@ -76,6 +78,11 @@ class Experiment:
         if self.teacher is not None and not self.algorithm.teacher_iterations:
             raise ValueError("teacher: only algorithm=distill learns from one; accepted: algorithm=distill")
         camera, lidar, network = self.observation.camera, self.observation.lidar, self.network
+        if self.race.others and not self.observation.next_objects and camera is None and lidar is None:
+            raise ValueError(
+                f"observation.next_objects=0: the policy would not see the {self.race.others} others of the race; "
+                "accepted: observation.next_objects=2, or observation=camera, lidar, ..."
+            )
         if isinstance(network, MLPConfig) and camera is not None:
             raise ValueError(
                 "network: reads features, and observation.camera gives pictures; accepted: network=cnn_small, "

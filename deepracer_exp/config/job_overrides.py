@@ -16,7 +16,7 @@ _NOT_APPLICABLE = {
     r"DR_TRAIN_(MIN_EVAL|BEST|MAX_STEPS|RTF)|MIN_EVAL_TRIALS|BEST_MODEL_METRIC": "not applicable: how the service "
     "evaluates and batches; here values of evaluation, checkpoints and algorithm",
     r"DR_EVAL_": "not applicable: for evaluations; here `deepracer-exp evaluate RUN evaluation=NAME`",
-    r"DR_(OA|H2B)_": "not applied: for races with others, which are not built yet",
+    r"DR_(OA|H2B)_": "not applied: here race=NAME and its keys choose boxes and bots",
     r"": "no effect on a training here: names, colours, places and parts of the service",
 }
 """Keys that have no effect here, the first pattern that matches, and why."""
@@ -118,7 +118,7 @@ def _remarks(workers: Sequence[JobSettings]) -> Iterator[tuple[str, str]]:
     for worker in workers:
         key = worker.keys["RACE_TYPE"]
         if worker.race_type != "TIME_TRIAL":
-            alone = "races with others are not built yet; the car drives alone"
+            alone = "the car drives alone; here race=NAME and its keys choose boxes and bots"
             yield worker.name, f"{key}={worker.race_type}: not applied: {alone}"
         if (worker.start_advance, worker.start_offset, worker.changes_start) != (
             first.start_advance,

@@ -37,7 +37,13 @@ class Lidar:
     """
 
     def __init__(
-        self, config: LidarConfig, tracks: Sequence[Track], cars: Sequence[int], period_s: float, boxes: int
+        self,
+        config: LidarConfig,
+        tracks: Sequence[Track],
+        cars: Sequence[int],
+        period_s: float,
+        boxes: int,
+        others: int = 0,
     ) -> None:
         """Set up the walls; call `seed` and then `begin` next.
 
@@ -46,7 +52,8 @@ class Lidar:
             tracks: one per course.
             cars: their numbers over all processes.
             period_s: control period.
-            boxes: around each car.
+            boxes: beside the road around each car.
+            others: boxes and bots on the road around each car.
         """
         self._config, self._cars = config, list(cars)
         rings = [None if track.floor.walls_height_m < MOUNT_Z_M else wall_ring(track) for track in tracks]
@@ -55,7 +62,8 @@ class Lidar:
         self._walls = np.full((len(walls), max(map(len, walls)), 4), np.nan)
         for row, some in zip(self._walls, walls, strict=True):
             row[: len(some)] = some
-        self._segments = np.empty((len(self._cars), self._walls.shape[1] + 4 * boxes, 4))
+        self._standing = self._walls.shape[1] + 4 * boxes
+        self._segments = np.empty((len(self._cars), self._standing + 4 * others, 4))
         self._scans_per_step = SCANS_PER_S * period_s
         self._noise_start = np.zeros(len(self._cars), np.int64)
         self._noise = np.random.default_rng(0).standard_normal(_NOISE_NUMBERS)
@@ -80,9 +88,14 @@ class Lidar:
             boxes: around these cars, (n, boxes, 6 or more), see `camera.take_pictures`; None: there are none.
         """
         walls = self._walls[course]
-        self._segments[ids] = walls if boxes is None else np.hstack([walls, box_sides(boxes)])
+        standing = walls if boxes is None else np.hstack([walls, box_sides(boxes)])
+        self._segments[ids, : self._standing] = standing
         for car, episode in zip(ids.tolist(), episodes.tolist(), strict=True):
             self._noise_start[car] = self._streams.stream(car, episode).integers(_NOISE_NUMBERS)
+
+    def show(self, ids: Ids, others: NDArray[np.float32]) -> None:
+        """Set where boxes and bots on the road of the cars `ids` are, (n, others, 9), see `camera.take_pictures`."""
+        self._segments[ids, self._standing :] = box_sides(others)
 
     def read(self, ids: Ids, state: CarState, steps: NDArray[np.int64]) -> Readings:
         """Return the readings of new scans by the cars `ids`, (n, size).

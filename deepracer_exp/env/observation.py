@@ -11,6 +11,11 @@ from deepracer_exp.tracks.track import TrackIndex, Tracks
 
 from .state import Measures
 
+OTHERS = ("gap", "side", "closing", "bot")
+"""What is observed of each of the next others, see `RaceOthers.features`."""
+_NOBODY = np.array([1, 0, 0, 0], np.float32)
+"""The same where there is no other."""
+
 
 class ObservationPart:
     """Features of your own, appended to ours; it keeps no state, because a resumed run builds it again.
@@ -92,6 +97,7 @@ def _names(config: ObservationConfig, parts: Sequence[ObservationPart]) -> tuple
         "last_steering",
         "last_speed",
         *(f"ahead_{axis}_{distance:g}" for distance in config.lookahead_m for axis in "xy"),
+        *(f"next_{number}_{what}" for number in range(1, config.next_objects + 1) for what in OTHERS),
         *(name for part in parts for name in part.names),
     )
 
@@ -103,7 +109,8 @@ class Features:
     and `heading_error_cos` of the car's yaw against the centre line; `speed` and `yaw_rate` as measured;
     `last_steering` and `last_speed` as last commanded, over the largest of the action space; then for each
     look-ahead distance `ahead_x_D` and `ahead_y_D`: the centre line's point D metres further on in the frame
-    of the car's front point, x forward and y to the left; then those of the parts.
+    of the car's front point, x forward and y to the left; then `next_N_gap` and so on of the next boxes and bots
+    (`RaceOthers.features`); then those of the parts.
     """
 
     def __init__(
@@ -122,7 +129,12 @@ class Features:
         self.names = _names(config, parts)
 
     def compute(
-        self, now: Measures, track_index: TrackIndex, steering_deg: np.ndarray, commanded_mps: np.ndarray
+        self,
+        now: Measures,
+        track_index: TrackIndex,
+        steering_deg: np.ndarray,
+        commanded_mps: np.ndarray,
+        others: np.ndarray | None = None,
     ) -> np.ndarray:
         """Return the features, shape (N, len(names)), float32.
 
@@ -131,6 +143,7 @@ class Features:
             track_index: index of each car's track, (N,).
             steering_deg: last commanded steering (N,).
             commanded_mps: last commanded speed (N,).
+            others: what is observed of the next boxes and bots, (N, len(OTHERS) * next_objects); None: nobody is there.
         """
         config = self._config
         road = self._tracks.points_at(now.ndist[:, None] + self._ahead_ndist[track_index], track_index)
@@ -149,6 +162,9 @@ class Features:
         end = 7 + 2 * road.shape[1]
         out[:, 7:end:2] = dx * cos + dy * sin
         out[:, 8:end:2] = dy * cos - dx * sin
+        if config.next_objects:
+            begin, end = end, end + len(OTHERS) * config.next_objects
+            out[:, begin:end] = np.tile(_NOBODY, config.next_objects) if others is None else others
         for part in self._parts:
             begin, end = end, end + len(part.names)
             out[:, begin:end] = part.compute(now, steering_deg, commanded_mps)

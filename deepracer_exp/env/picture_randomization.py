@@ -125,7 +125,7 @@ class PictureRandomization:
             if (np.hypot(taken[:, 0] - x, taken[:, 1] - y) > taken[:, 2] + radius).all():
                 taken = np.concatenate([taken, [[x, y, radius]]])
                 row[:6] = x, y, 2 * np.pi * draw[4], fit * length, fit * width, height
-        boxes[: len(objects), 6:] = self._exposed(np.array([car]), 255 * objects[None, :, 5:])[0]
+        boxes[: len(objects), 6:] = self.exposed(np.array([car]), 255 * objects[None, :, 5:])[0]
 
     def mounts(self, ids: Ids, mount: Floats) -> Floats:
         """Return the randomized mounts (n, 5) of the cars' cameras, given the lens's `camera.Lens.mount`, (5,)."""
@@ -139,9 +139,10 @@ class PictureRandomization:
 
     def colors(self, ids: Ids, colors: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the colours that cars see, given those of their tracks, (n, materials, 3), 0 to 255."""
-        return self._exposed(ids, np.clip(colors * self._color_factor[ids], 0, 255))
+        return self.exposed(ids, np.clip(colors * self._color_factor[ids], 0, 255))
 
-    def _exposed(self, ids: Ids, colors: Floats) -> NDArray[np.float32]:
+    def exposed(self, ids: Ids, colors: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Return colours as the light of the episode and the camera make them, (n, any number, 3), 0 to 255."""
         seen = 255 * (colors / 255) ** self._of("gamma_scale", ids)[:, None, None]
         seen = (seen - _MIDDLE) * self._of("contrast_scale", ids)[:, None, None] + _MIDDLE
         seen = np.clip(seen * self._of("brightness_scale", ids)[:, None, None], 0, 255)

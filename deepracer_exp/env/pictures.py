@@ -72,16 +72,23 @@ class Pictures:
         self._floor_colors = np.stack([floor_colors(track.floor) for track in tracks])
         self._grey = config.color == "grey"
 
-    def first(self, ids: Ids, state: CarState, course: NDArray[np.intp]) -> Pixels:
+    def first(
+        self,
+        ids: Ids,
+        state: CarState,
+        course: NDArray[np.intp],
+        others: NDArray[np.float32] | None = None,
+    ) -> Pixels:
         """Return the first observations of the cars `ids`, (n, *shape): earlier pictures equal the present one.
 
         Args:
             ids: indices of the cars, (n,).
             state: of these cars, arrays (n,).
             course: index of each of these cars' track, (n,).
+            others: boxes and bots on the road, in red, green and blue, (n, K, 9), see `camera.take_pictures`.
         """
         still = np.zeros((len(course), 2))
-        now = self._take(ids, state, still, course, np.zeros(len(course), np.int64))
+        now = self._take(ids, state, still, course, np.zeros(len(course), np.int64), others)
         return np.tile(now, (1, self.shape[0] // self._now, 1, 1))
 
     def next(
@@ -92,6 +99,7 @@ class Pictures:
         course: NDArray[np.intp],
         steps: NDArray[np.int64],
         dropped: NDArray[np.bool_] | None,
+        others: NDArray[np.float32] | None = None,
     ) -> Pixels:
         """Return the observations of all cars after `before`, (N, *shape).
 
@@ -102,8 +110,9 @@ class Pictures:
             course: index of each car's track, (N,).
             steps: control steps of each car's episode, (N,).
             dropped: cars that see nothing new, (N,); None: there are none.
+            others: boxes and bots on the road, (N, K, 9), as for `first`.
         """
-        now = self._take(np.arange(len(before)), state, acceleration_mps2, course, steps)
+        now = self._take(np.arange(len(before)), state, acceleration_mps2, course, steps, others)
         out = now if self._now == self.shape[0] else np.concatenate([before[:, self._now :], now], axis=1)
         if dropped is not None:
             out[dropped] = before[dropped]
@@ -116,13 +125,17 @@ class Pictures:
         acceleration_mps2: NDArray[np.float64],
         course: NDArray[np.intp],
         steps: NDArray[np.int64],
+        others: NDArray[np.float32] | None,
     ) -> Pixels:
         ahead, left = self._tilt_rad_per_mps2 * acceleration_mps2.T
         poses = np.stack([state.x_m, state.y_m, state.yaw_rad, -ahead, left], axis=1)
         varied = self._varied
-        colors, boxes = self._floor_colors[course], None
+        colors, boxes = self._floor_colors[course], others
         if varied is not None:
             colors, boxes = varied.colors(ids, colors), varied.boxes(ids)
+            if others is not None:
+                others = np.concatenate([others[..., :6], varied.exposed(ids, others[..., 6:])], axis=-1)
+                boxes = others if boxes is None else np.concatenate([boxes, others], axis=1)
         if self._grey:
             colors = (colors @ GREY)[..., None]
             if boxes is not None:

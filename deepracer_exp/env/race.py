@@ -1,6 +1,7 @@
 """N cars on their tracks under the service's rules, as NumPy arrays, so that any learning library can drive them."""
 
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,12 @@ from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.rewards.prints import RewardPrints
 from deepracer_exp.rewards.reward import RewardFunction
 from deepracer_exp.sim.batch import CarBatch, CarState
+from deepracer_exp.tracks.lanes import INNER, OUTER, Lanes
+from deepracer_exp.tracks.track import Pose
 
 from .lidar import Lidar
 from .observation import Features
+from .others import RaceOthers
 from .picture_randomization import PictureRandomization
 from .pictures import Pictures
 from .randomization import Randomization
@@ -55,6 +59,7 @@ class Race:
         terminated: the last step ended the episode, (N,), bool.
         truncated: the last step cut the drive off, see `StepResult`, (N,), bool.
         trace: one row per car for the last step, columns `env.trace.PACKED_COLUMNS`, (N, C), float64.
+        others: the boxes and bots on the road; None: the cars are alone.
     """
 
     def __init__(
@@ -85,6 +90,7 @@ class Race:
         self._floors = np.array([course.tracks[0].floor.friction for course in setup.courses])
         self._batch = CarBatch(setup.car, n_cars, threads, self._floors[self.rules.course])
         self._reward_function = RewardFunction(setup.reward, n_cars, setup.reward_time_limit_s, prints)
+        self.others = None if setup.others is None else RaceOthers(setup.others, setup, self.rules)
         low, high = setup.actions.low, setup.actions.high
         # A space that only drives straight ahead has no largest angle to divide by.
         steering_max_deg = max(abs(low[0]), abs(high[0])) or 1.0
@@ -98,6 +104,7 @@ class Race:
             self._features.names,
             setup.late_steps,
         )
+        self._sees_others = setup.observation.next_objects > 0
         self._everyone = np.arange(n_cars)
         self._return = np.zeros(n_cars)
         self._steering_deg = np.zeros(n_cars)
@@ -122,8 +129,9 @@ class Race:
         )
         self.pixels = np.zeros((n_cars, *(camera.shape if camera is not None else (0,))), np.uint8)
         boxes = 0 if self._varied is None else self._varied.most_boxes
+        others = 0 if setup.others is None else setup.others.others
         self._lidar = (
-            None if lidar is None else Lidar(lidar, tracks, self.cars.tolist(), self._period_s, boxes)
+            None if lidar is None else Lidar(lidar, tracks, self.cars.tolist(), self._period_s, boxes, others)
         )
         self.lidar = np.zeros((n_cars, lidar.size if lidar is not None else 0), np.float32)
         self._kept = _KEPT if lidar is None else (*_KEPT, "lidar")
@@ -156,6 +164,8 @@ class Race:
             self._varied.seed(seed)
         if self._lidar is not None:
             self._lidar.seed(seed)
+        if self.others is not None:
+            self.others.seed(seed)
         self.rules.restart()
 
     def reset(
@@ -175,6 +185,8 @@ class Race:
         pose = self.rules.reset(ids, start_ndist, course)
         if course is not None:
             self._batch.set_floor_friction(ids, self._floors[course])
+        if self.others is not None:
+            pose = self.others.begin(ids, pose, evaluated=start_ndist is not None)
         for kept in (self._return, self._steering_deg, self._commanded_mps):
             kept[ids] = 0
         if self._servos is not None:
@@ -197,14 +209,32 @@ class Race:
             boxes = None if self._varied is None else self._varied.boxes(ids)
             self._lidar.begin(ids, episode, self.rules.course[ids], boxes)
 
-    def put_back(self, ids: np.ndarray, percent: np.ndarray) -> None:
-        """Put cars at rest on the centre line in the middle of their episodes; nothing is drawn again.
+    def put_back(
+        self,
+        ids: np.ndarray,
+        percent: np.ndarray,
+        crashed: np.ndarray | None = None,
+        restarts: np.ndarray | None = None,
+        hold_s: np.ndarray | None = None,
+    ) -> None:
+        """Put cars at rest on the track in the middle of their episodes; nothing is drawn again.
+
+        As on the service they continue in the lane that is nearer to where they left (deepracer-simapp,
+        agent_ctrl/rollout_agent_ctrl.py), and among others as `RaceOthers.put_back` says.
 
         Args:
             ids: indices of the cars.
             percent: progress at which they continue, (n,); see `RaceRules.put_back`.
+            crashed: whether they ran into a box or bot, (n,); None: none did.
+            restarts: whether they begin a lap at the start, on the centre line, (n,); None: none does.
+            hold_s: seconds for which each is held there, among others, (n,); None: not at all.
         """
-        pose = self.rules.put_back(ids, percent)
+        centre = self.rules.put_back(ids, percent)
+        pose = self._on_lanes(ids, centre, np.zeros(len(ids), bool) if restarts is None else restarts)
+        if self.others is not None:
+            crashed = np.zeros(len(ids), bool) if crashed is None else crashed
+            hold_s = np.zeros(len(ids)) if hold_s is None else hold_s
+            pose = self.others.put_back(ids, pose, percent, crashed, hold_s)
         for commanded in (self._steering_deg, self._commanded_mps):
             commanded[ids] = 0
         if self._servos is not None:
@@ -212,6 +242,19 @@ class Race:
         self.randomization.forget_commands(ids, self.rules.steps[ids])
         self._batch.place(ids, pose.x, pose.y, pose.yaw_rad)
         self._observe_started(ids)
+
+    def _on_lanes(self, ids: np.ndarray, centre: Pose, restarts: np.ndarray) -> Pose:
+        """Return poses on the lanes nearer to the cars, (n,) each, or on the centre line where a lap begins."""
+        points, track_index = np.stack([centre.x, centre.y], axis=-1), self.rules.track_index[ids]
+        x, y = self.trace[ids, PACKED["X"]], self.trace[ids, PACKED["Y"]]
+        sides = [self._lanes.poses(points, np.full(len(ids), lane), track_index) for lane in (INNER, OUTER)]
+        away_m = [np.hypot(side.x - x, side.y - y) for side in sides]
+        lane = np.where(restarts, 2, np.where(away_m[INNER] < away_m[OUTER], INNER, OUTER))
+        return Pose(*(np.choose(lane, parts) for parts in zip(*sides, centre, strict=True)))
+
+    @cached_property
+    def _lanes(self) -> Lanes:
+        return Lanes([track for course in self.setup.courses for track in course.tracks])
 
     def step(self, action: np.ndarray) -> None:
         """Apply the rules, compute the rewards and move the cars by one control period.
@@ -227,11 +270,14 @@ class Race:
         """
         steering_deg, speed_mps = self.setup.actions.commands(action)
         result = self.rules.apply()
+        objects: dict[str, np.ndarray] = {}
+        if self.others is not None:
+            result, objects = self.others.judge(result)
         self._require_finite(
             "action", np.stack([steering_deg, speed_mps], axis=1), ("steering", "speed"), action
         )
         self.terminated, self.truncated = result.terminated, result.truncated
-        params = self.rules.params(result, steering_deg, speed_mps)
+        params = {**self.rules.params(result, steering_deg, speed_mps), **objects}
         self.reward = self._reward_function(
             params, self.rules.track_params, result.running, self.rules.track_index
         )
@@ -254,6 +300,7 @@ class Race:
             "cars": self.cars.copy(),
             "referee": self.rules.state_dict(),
             "randomization": self.randomization.state_dict(),
+            **({} if self.others is None else {"others": self.others.state_dict()}),
             **{name.lstrip("_"): getattr(self, name).copy() for name in self._kept},
         }
 
@@ -279,6 +326,9 @@ class Race:
         for sight in (self._varied, self._lidar):
             if sight is not None:
                 sight.seed(state["randomization"]["seed"])
+        if self.others is not None:
+            self.others.seed(state["randomization"]["seed"])
+            self.others.load_state_dict(state["others"])
         self._begin_sight(self._everyone)
         self._batch.set_floor_friction(self._everyone, self._floors[self.rules.course])
         # Last: setting a car's mass overwrites parts of the physics state.
@@ -333,6 +383,8 @@ class Race:
         sent_deg, sent_mps, moving = self.randomization.disturb_commands(
             steering_deg, speed_mps, self.rules.steps
         )
+        if self.others is not None:
+            moving = moving & ~self.others.held
         self._batch.drive(sent_mps, np.radians(sent_deg), moving=moving)
 
     def _observe(self) -> None:
@@ -348,8 +400,10 @@ class Race:
                 self.rules.course,
                 self.rules.steps,
                 self.randomization.dropped,
+                self._boxes(self._everyone),
             )
         if self._lidar is not None:
+            self._show_lidar(self._everyone)
             self.lidar = self._lidar.next(self.lidar, state, self.rules.steps, self.randomization.dropped)
 
     def _observe_started(self, ids: np.ndarray) -> None:
@@ -367,14 +421,24 @@ class Race:
         )
         if self._pictures is not None:
             self.pixels = self.pixels.copy()
-            self.pixels[ids] = self._pictures.first(ids, state, self.rules.course[ids])
+            self.pixels[ids] = self._pictures.first(ids, state, self.rules.course[ids], self._boxes(ids))
         if self._lidar is not None:
+            self._show_lidar(ids)
             self.lidar = self.lidar.copy()
             self.lidar[ids] = self._lidar.read(ids, state, self.rules.steps[ids])
 
+    def _boxes(self, ids: np.ndarray) -> np.ndarray | None:
+        return None if self.others is None else self.others.boxes(ids)
+
+    def _show_lidar(self, ids: np.ndarray) -> None:
+        if self._lidar is not None and self.others is not None:
+            self._lidar.show(ids, self.others.boxes(ids))
+
     def _features_of(self, measures: Measures, ids: np.ndarray) -> np.ndarray:
+        others = self.others
+        ahead = None if others is None or not self._sees_others else others.features(ids, measures)
         return self._features.compute(
-            measures, self.rules.track_index[ids], self._steering_deg[ids], self._commanded_mps[ids]
+            measures, self.rules.track_index[ids], self._steering_deg[ids], self._commanded_mps[ids], ahead
         )
 
     def _lost_car(self, error: RunFailed, action: np.ndarray) -> RunFailed:

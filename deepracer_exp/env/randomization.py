@@ -37,6 +37,7 @@ class Purpose(IntEnum):
     LIDAR = 4
     LENS = 5
     POLICY = 6
+    OTHERS = 7
 
 
 class CarStreams:

@@ -295,9 +295,7 @@ class RaceRules:
         previous = np.where(self.steps > 2, self._last_progress, percent)
         # `reset` writes zeros into what is kept here; a StepResult must not change.
         self._last_progress, self._last_front = percent.copy(), now.front
-        truncated = status == STATUS_CODE["time_up"]
-        if not self._episodes.lap_terminates:
-            truncated |= (status == STATUS_CODE["lap_complete"]) & self.tracks.closed[self.track_index]
+        terminated, truncated = self.ends(status)
         return StepResult(
             now=now,
             running=self.steps > 1,
@@ -306,9 +304,21 @@ class RaceRules:
             all_wheels_on_track=np.asarray(wheels_on.all(axis=1)),
             off_track=off_track,
             status=status,
-            terminated=(status > STATUS_CODE["in_progress"]) & ~truncated,
+            terminated=terminated,
             truncated=truncated,
         )
+
+    def ends(self, status: NDArray[np.int64]) -> tuple[Bools, Bools]:
+        """Return which status codes of all cars, (N,), terminate their episodes, and which cut them off, (N,) each."""
+        truncated = status == STATUS_CODE["time_up"]
+        if not self._episodes.lap_terminates:
+            truncated |= (status == STATUS_CODE["lap_complete"]) & self.tracks.closed[self.track_index]
+        going = (status <= STATUS_CODE["in_progress"]) | (status == STATUS_CODE["pause"])
+        return ~going & ~truncated, truncated
+
+    def rest(self, ids: Ids) -> None:
+        """Forget how long the cars `ids` have stood or driven backwards."""
+        self._episode_rules.reset(ids)
 
     def params(
         self, result: StepResult, steering_deg: np.ndarray, speed_mps: np.ndarray

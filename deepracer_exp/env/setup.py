@@ -12,8 +12,10 @@ from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.driving import EpisodeConfig, ObservationConfig, RandomizationConfig
 from deepracer_exp.config.evaluation import RealCarConfig
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.race import RaceConfig
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.source import RewardSource, load_reward_source
+from deepracer_exp.sim.others import check_room
 from deepracer_exp.tracks.track import Track, directed_tracks
 
 from .action_space import ActionSpace, build_action_space
@@ -89,6 +91,8 @@ class RaceSetup:
     reward: RewardSource
     reward_time_limit_s: float
     seed: int
+    others: RaceConfig | None = None
+    """Boxes and bots around every car; None: it is alone."""
     real_car: RealCarConfig | None = None
     late_steps: tuple[int, int] = (0, 0)
     """Control steps by which steering and speed commands reach every car later than drawn."""
@@ -108,14 +112,19 @@ def build_setup(
     courses: tuple[Course, ...] | None = None,
     reward: RewardSource | None = None,
     files: RaceFiles | None = None,
+    race: RaceConfig | None = None,
 ) -> RaceSetup:
-    """Build the race of an experiment; `courses` and `reward` replace its own, files that were not read are read.
+    """Build the race of an experiment; `courses`, `reward` and `race` replace its own, files not read yet are read.
 
     Raises:
-        BadInput: a route, model_metadata or reward file is missing or malformed, or values contradict.
+        BadInput: a route, model_metadata or reward file is missing or malformed, values contradict, or a track has no
+            room for the others.
     """
+    courses = courses or build_courses(experiment, {} if files is None else files.tracks)
+    race = race or experiment.race
+    check_room(race, [(course.name, course.tracks[0]) for course in courses])
     return RaceSetup(
-        courses=courses or build_courses(experiment, {} if files is None else files.tracks),
+        courses=courses,
         car=experiment.car,
         actions=build_action_space(experiment.action_space) if files is None else files.actions,
         observation=experiment.observation,
@@ -125,4 +134,5 @@ def build_setup(
         reward=reward or (load_reward_source(experiment.reward) if files is None else files.reward),
         reward_time_limit_s=experiment.reward.time_limit_s,
         seed=experiment.seed,
+        others=race if race.others else None,
     )

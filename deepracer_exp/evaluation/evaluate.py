@@ -53,6 +53,7 @@ def results_table(
     lines = [(label, group.condition.replace("_", " "), group.statistics()) for label, group in groups]
     penalties = any(vars(config.penalty_s).values())
     hidden = (() if config.resets_per_lap else ("resets",)) + (() if penalties else ("penalty s",))
+    hidden += () if evaluation.among_others else ("crash-free %", "crashes")
 
     def lay_out(intervals: bool, left_out: Sequence[str]) -> Table:
         rows = [(label, condition, _cells(numbers, intervals)) for label, condition, numbers in lines]
@@ -136,6 +137,7 @@ def _cells(statistics: Mapping[str, Any], intervals: bool) -> dict[str, str]:
     times = statistics["lap_time_s"]
     return {
         "laps": f"{statistics['laps']} of {statistics['laps_tried']}",
+        "crash-free %": _mean(statistics["crash_free"], 0, intervals, 100.0),
         "done %": _mean(statistics["completion"], 1, intervals),
         "lap s": _mean(times, 2, intervals),
         "median": number(times["median"], 2),
@@ -143,16 +145,17 @@ def _cells(statistics: Mapping[str, Any], intervals: bool) -> dict[str, str]:
         "std": number(times["std"], 2),
         "resets": _mean(statistics["resets"], 1, intervals),
         "penalty s": _mean(statistics["penalty_s"], 1, intervals),
+        "crashes": _mean(statistics["crashes"], 1, intervals),
         "score s": number(statistics["race_score_s"], 2),
         "zig-zag /m": _mean(statistics["zigzag"]["changes_per_m"], 2, intervals),
     }
 
 
-def _mean(statistics: Mapping[str, Any], digits: int, intervals: bool) -> str:
-    mean = number(statistics["mean"], digits)
+def _mean(statistics: Mapping[str, Any], digits: int, intervals: bool, factor: float = 1.0) -> str:
+    mean = number(None if statistics["mean"] is None else factor * statistics["mean"], digits)
     if statistics["interval"] is None or not intervals:
         return mean
-    low, high = (number(bound, digits) for bound in statistics["interval"])
+    low, high = (number(factor * bound, digits) for bound in statistics["interval"])
     return mean if low == high else f"{mean} ({low}\N{EN DASH}{high})"
 
 
@@ -213,9 +216,10 @@ def official_places(
 ) -> dict[str, list[Standing]]:
     """Return where the usual laps would stand on the official boards of each track that has any, the best known first.
 
-    Laps driven as the physical car does have no place: its racers drove in the simulator.
+    The boards are those of time trials in the simulator: laps among boxes or bots have no place there, nor have those
+    driven as the physical car does.
     """
-    if config.real_car is not None:
+    if config.real_car is not None or evaluation.among_others:
         return {}
     courses, observation = tracks_of(experiment, config), experiment.observation
     by_track = {}

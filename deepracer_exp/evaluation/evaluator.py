@@ -15,6 +15,7 @@ from deepracer_exp.config.driving import RandomizationConfig
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.overrides import override_line
+from deepracer_exp.config.race import RaceConfig
 from deepracer_exp.config.track import TrackConfig
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.real_car import as_the_car, require_car
@@ -81,7 +82,7 @@ class Evaluator:
             for start in _starts(config, course.tracks[0].closed, condition)
         ]
         setup = replace(
-            build_setup(experiment, courses, NO_REWARD),
+            build_setup(experiment, courses, NO_REWARD, race=_race(config, experiment)),
             randomization=conditions[USUAL],
             # The protocol limits the time.
             episode=replace(experiment.episode, max_steps=0),
@@ -107,7 +108,8 @@ class Evaluator:
             RunFailed: an action or a car's state became NaN or infinite.
         """
         race, config = self.race, self.config
-        protocol = RaceProtocol(config, self._closed, race.setup.car.control_period_s)
+        among_others = race.others is not None
+        protocol = RaceProtocol(config, self._closed, race.setup.car.control_period_s, among_others)
         trace: list[NDArray[np.float64]] = []
         race.seed(config.seed)
         race.reset(None, self._course, self._start_ndist)
@@ -123,14 +125,14 @@ class Evaluator:
                 race.step(acted["action"].numpy())
                 row = race.trace
                 trace.append(np.column_stack([row[:, _DRIVEN], protocol.running]))
-                cars, progress = protocol.step(
+                back = protocol.step(
                     row[:, PACKED["episode_status"]].astype(np.int64), row[:, PACKED["progress"]]
                 )
                 if on_step is not None:
                     on_step(race, protocol, acted)
-                if len(cars):
-                    race.put_back(cars, progress)
-        return Evaluation(tuple(self._groups(protocol, np.stack(trace, axis=1))))
+                if len(back.cars):
+                    race.put_back(*back)
+        return Evaluation(tuple(self._groups(protocol, np.stack(trace, axis=1))), among_others)
 
     def _groups(self, protocol: RaceProtocol, trace: NDArray[np.float64]) -> list[TrialGroup]:
         zigzags = [self._zigzag(trial.course, rows) for trial, rows in zip(self.trials, trace, strict=True)]
@@ -195,6 +197,15 @@ def _conditions(key: str, option: str | None, experiment: Experiment) -> Randomi
         return compose_option("randomization", option, RandomizationConfig)
     except BadInput as error:
         raise BadInput(f"evaluation.{key}", error) from None
+
+
+def _race(config: EvaluationConfig, experiment: Experiment) -> RaceConfig:
+    if config.race is None:
+        return experiment.race
+    try:
+        return compose_option("race", config.race, RaceConfig)
+    except BadInput as error:
+        raise BadInput("evaluation.race", error) from None
 
 
 def _starts(config: EvaluationConfig, closed: bool, condition: str) -> NDArray[np.float64]:

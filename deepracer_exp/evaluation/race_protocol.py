@@ -1,6 +1,7 @@
 """Race protocol: laps, resets, penalties and the race clock of cars."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from deepracer_exp.env.trace import EPISODE_STATUS, STATUS_CODE
 Floats = NDArray[np.float64]
 Ids = NDArray[np.intp]
 
-_LAP, _UP = "lap_complete", "time_up"
+_LAP, _UP, _CRASH = "lap_complete", "time_up", "crashed"
 _ROUNDING_S = 1e-9
 
 
@@ -31,7 +32,9 @@ class Attempt:
     progress: float
     """Per cent of the lap, 100 if complete."""
     end: str
-    """`lap_complete`, what failed it (`off_track`, `reversed`, `immobilized`), or `time_up`."""
+    """`lap_complete`, what failed it (`off_track`, `crashed`, `reversed`, `immobilized`), or `time_up`."""
+    crashes: int = 0
+    """How often the car ran into a box or bot and was at fault."""
 
     @property
     def complete(self) -> bool:
@@ -39,16 +42,35 @@ class Attempt:
         return self.end == _LAP
 
     @property
+    def crash_free(self) -> bool:
+        """Whether it counts as a lap, and the car ran into nothing."""
+        return self.complete and not self.crashes
+
+    @property
     def cut_off(self) -> bool:
         """Whether the end of the race interrupted it."""
         return self.end == _UP
 
 
+class PutBack(NamedTuple):
+    """Cars to put back on the track, at rest; arrays (n,)."""
+
+    cars: Ids
+    percent: Floats
+    """Progress at which they continue."""
+    crashed: NDArray[np.bool_]
+    restarts: NDArray[np.bool_]
+    """Whether they begin a new lap at its start."""
+    hold_s: Floats
+    """Seconds for which they are held there."""
+
+
 class RaceProtocol:
     """Applies a protocol to N cars, one trial each: which are put back, and which have finished.
 
-    The race clock of a trial is that of `rules.lap_clock_s`, which starts with the reset before the prepare step; each
-    penalty advances it by its seconds.
+    The race clock of a trial is that of `rules.lap_clock_s`, which starts with the reset before the prepare step. A car
+    alone on the track continues at once, and a penalty advances its clock by its seconds; among others it is held for
+    so long, while bots drive on.
 
     Attributes:
         running: unfinished trials, (N,), bool.
@@ -56,17 +78,21 @@ class RaceProtocol:
         clock_s: race clock at the latest poses, (N,).
     """
 
-    def __init__(self, config: EvaluationConfig, closed: NDArray[np.bool_], period_s: float):
+    def __init__(
+        self, config: EvaluationConfig, closed: NDArray[np.bool_], period_s: float, among_others: bool = False
+    ):
         """Start all trials.
 
         Args:
             config: the protocol.
             closed: whether a completed lap leads into the next one, (N,).
             period_s: simulated seconds of a control step.
+            among_others: whether there are boxes or bots.
         """
         n_cars = len(closed)
         self._config, self._closed, self._period_s = config, closed, period_s
         self._penalty_s = vars(config.penalty_s)
+        self._among_others = among_others
         self._steps = 0
         self.running = np.ones(n_cars, bool)
         self.attempts: list[Attempt] = []
@@ -74,9 +100,10 @@ class RaceProtocol:
         self._laps = np.zeros(n_cars, np.int64)
         self._begin_s, self._lap_penalty_s, self._all_penalties_s = (np.zeros(n_cars) for _ in range(3))
         self._resets = np.zeros(n_cars, np.int64)
+        self._crashes = np.zeros(n_cars, np.int64)
         self._progress = np.zeros(n_cars)
 
-    def step(self, status: NDArray[np.int64], progress: Floats) -> tuple[Ids, Floats]:
+    def step(self, status: NDArray[np.int64], progress: Floats) -> PutBack:
         """Process one control step.
 
         Args:
@@ -84,7 +111,7 @@ class RaceProtocol:
             progress: per cent of the lap, (N,).
 
         Returns:
-            The cars to put back on the centre line, at rest, and where, in per cent of the lap, (n,) each.
+            The cars to put back.
         """
         self._steps += 1
         driven_s = lap_clock_s(self._steps, self._period_s)
@@ -94,36 +121,41 @@ class RaceProtocol:
             self.clock_s[car] = self._config.time_s
             self._close(car, _UP, progress[car])
             self.running[car] = False
-        back: list[tuple[int, float]] = []
-        for car in np.flatnonzero(self.running & (status > STATUS_CODE["in_progress"])).tolist():
+        back: list[_Back] = []
+        over = (status > STATUS_CODE["in_progress"]) & (status != STATUS_CODE["pause"])
+        for car in np.flatnonzero(self.running & over).tolist():
             self._decide(car, EPISODE_STATUS[status[car]], progress[car], back)
         # The last progress on the track: beyond its border another section may be closer.
         self._progress = np.where(status == STATUS_CODE[_LAP], 0.0, progress)
-        for car, percent in back:
-            self._progress[car] = percent
-        cars, percents = zip(*back, strict=True) if back else ((), ())
-        return np.array(cars, np.intp), np.array(percents)
+        for one in back:
+            self._progress[one.car] = one.percent
+        columns = zip(*back, strict=True) if back else ((),) * len(_Back._fields)
+        types = (np.intp, np.float64, np.bool_, np.bool_, np.float64)
+        return PutBack(*(np.array(values, kind) for values, kind in zip(columns, types, strict=True)))
 
-    def _decide(self, car: int, what: str, progress: float, back: list[tuple[int, float]]) -> None:
+    def _decide(self, car: int, what: str, progress: float, back: list["_Back"]) -> None:
         config = self._config
+        self._crashes[car] += what == _CRASH
         if what == _LAP:
             self._close(car, what, 100.0)
             self._laps[car] += 1
             if self._laps[car] == config.laps:
                 self.running[car] = False
             elif not self._closed[car]:
-                back.append((car, 0.0))
+                back.append(_Back(car, 0.0, restarts=True))
         elif self._resets[car] < config.resets_per_lap:
             self._resets[car] += 1
-            self._lap_penalty_s[car] += self._penalty_s[what]
-            self._all_penalties_s[car] += self._penalty_s[what]
-            back.append((car, max(0.0, self._progress[car])))
+            penalty_s = self._penalty_s[what]
+            self._lap_penalty_s[car] += penalty_s
+            self._all_penalties_s[car] += 0.0 if self._among_others else penalty_s
+            hold_s = penalty_s if self._among_others else 0.0
+            back.append(_Back(car, max(0.0, self._progress[car]), what == _CRASH, hold_s=hold_s))
         else:
             self._close(car, what, progress)
             if config.failed_lap == "ends_trial":
                 self.running[car] = False
             else:
-                back.append((car, 0.0))
+                back.append(_Back(car, 0.0, restarts=True))
 
     def _close(self, car: int, end: str, progress: float) -> None:
         """Record the attempted lap and start the next one."""
@@ -136,8 +168,20 @@ class RaceProtocol:
                 resets=int(self._resets[car]),
                 progress=float(np.clip(progress, 0.0, 100.0)),
                 end=end,
+                crashes=int(self._crashes[car]),
             )
         )
         self._begin_s[car] = self.clock_s[car]
         self._lap_penalty_s[car] = 0.0
         self._resets[car] = 0
+        self._crashes[car] = 0
+
+
+class _Back(NamedTuple):
+    """One car of a `PutBack`."""
+
+    car: int
+    percent: float
+    crashed: bool = False
+    restarts: bool = False
+    hold_s: float = 0.0

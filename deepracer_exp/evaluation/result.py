@@ -65,6 +65,11 @@ class TrialGroup:
         return len(self.lap_times_s) / len(self.decided)
 
     @property
+    def crash_free_share(self) -> float:
+        """Complete laps without a crash per attempted lap."""
+        return sum(attempt.crash_free for attempt in self.decided) / len(self.decided)
+
+    @property
     def mean_lap_time_s(self) -> float | None:
         """Mean time of the complete laps, None without one."""
         times = self.lap_times_s
@@ -121,6 +126,8 @@ class TrialGroup:
             },
             "resets": _mean(self._per_trial(self.attempts, lambda a: float(a.resets)), once),
             "penalty_s": _mean(self._per_trial(self.attempts, lambda a: a.penalty_s), once),
+            "crashes": _mean(self._per_trial(self.attempts, lambda a: float(a.crashes)), once),
+            "crash_free": _mean(self._per_trial(decided, lambda a: float(a.crash_free)), count),
             "race_score_s": self.race_score_s,
             "zigzag": self._zigzag_statistics(),
         }
@@ -152,6 +159,8 @@ class Evaluation:
 
     groups: tuple[TrialGroup, ...]
     """One for each track and condition, track by track."""
+    among_others: bool = False
+    """Whether there were boxes or bots on the road."""
 
     @property
     def tracks(self) -> list[str]:

@@ -69,7 +69,8 @@ def outcome(run: RunRecord) -> list[tuple[str, str]]:
 def official_place(run: RunRecord) -> str | None:
     """Return where the mean of the evaluated laps would stand on the official board of a run's track, in words.
 
-    None: there is no complete lap, the run has several tracks, or its track has no board or is driven the other way.
+    None: there is no complete lap, the run has several tracks or others on the road, or its track has no board or is
+    driven the other way.
 
     Raises:
         BadInput: as for `outcome`.
@@ -78,6 +79,9 @@ def official_place(run: RunRecord) -> str | None:
     mean_lap_s = result.lap_time_s if result is not None and result.evaluated else None
     track, protocol = config.get("track") or {}, config.get("evaluation") or {}
     alone = track.get("direction") == "forward" and track.get("file") is None and track.get("knots") is None
+    race = config.get("race") or {}
+    others = [race.get(kind) or {} for kind in ("boxes", "bots")]
+    alone = alone and not any(some.get("number") or some.get("positions") for some in others)
     if mean_lap_s is None or not alone or protocol.get("tracks") is not None:
         return None
     observation, penalty_s = config.get("observation") or {}, protocol.get("penalty_s") or {}

@@ -1,5 +1,6 @@
 """The params dict that a reward function gets, as AWS DeepRacer defines it."""
 
+import itertools
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
@@ -26,6 +27,24 @@ Per cent of the lap; at the first step of an episode that is rewarded, the progr
 """
 
 
+OBJECT_COLUMNS = (
+    "is_crashed",
+    "closest_objects",
+    "objects_location",
+    "objects_left_of_center",
+    "object_in_camera",
+    "objects_speed",
+    "objects_heading",
+    "objects_distance_from_center",
+    "objects_distance",
+)
+"""The keys about boxes and bots, one row per car: of K others (N, K), `objects_location` (N, K, 2); `is_crashed` and
+`object_in_camera` (N,), `closest_objects` (N, 2). Columns have them only where there are others."""
+MASK = "objects_mask"
+"""The further key of `reward_batch`: which entries of the arrays about others are others, (N, K); all others of a car
+come first."""
+
+
 class TrackParams(NamedTuple):
     """The keys that are constant on a course."""
 
@@ -48,6 +67,9 @@ def select(columns: Mapping[str, np.ndarray], cars: NDArray[np.intp] | None) -> 
     for key in BATCH_COLUMNS:
         column = columns[key]
         chosen[key] = np.array(column if cars is None else column[cars], dtype=_DTYPES.get(key, np.float64))
+    if MASK in columns:
+        for key in (*OBJECT_COLUMNS, MASK):
+            chosen[key] = columns[key].copy() if cars is None else columns[key][cars]
     return chosen
 
 
@@ -56,17 +78,26 @@ def rows(selected: Mapping[str, np.ndarray]) -> Iterable[Row]:
     return zip(*(selected[key].tolist() for key in COLUMNS), strict=True)
 
 
-def scalar_params(row: Row, road: TrackParams) -> dict[str, Any]:
+def object_rows(selected: Mapping[str, np.ndarray]) -> Iterable[Row | None]:
+    """Return one tuple of Python values per car, in the order of `OBJECT_COLUMNS`; None for cars that are alone."""
+    if MASK not in selected:
+        return itertools.repeat(None, len(selected["x"]))
+    return zip(*(selected[key].tolist() for key in OBJECT_COLUMNS), strict=True)
+
+
+def scalar_params(row: Row, road: TrackParams, objects: Row | None = None) -> dict[str, Any]:
     """Build the 27 keys for one car.
 
     Every list is a fresh one, so that nothing a reward function does to it reaches another call; the keys
-    about other objects hold the defaults of an empty road (deepracer-simapp agent_ctrl/constants.py).
+    about other objects hold the defaults of an empty road (deepracer-simapp agent_ctrl/constants.py), unless there are
+    some.
 
     Args:
         row: One tuple of `rows`; lengths in metres, angles in degrees, speed in m/s, time in seconds.
         road: The keys that are constant on the course.
+        objects: One tuple of `object_rows`; distances in metres, headings in degrees, speeds in m/s.
     """
-    return dict(
+    params = dict(
         zip(COLUMNS, row, strict=True),
         track_length=road.track_length,
         waypoints=road.waypoints[:],
@@ -82,31 +113,43 @@ def scalar_params(row: Row, road: TrackParams) -> dict[str, Any]:
         objects_distance_from_center=[],
         objects_distance=[],
     )
+    if objects is not None:
+        params.update(zip(OBJECT_COLUMNS, objects, strict=True))
+    return params
 
 
 def batch_params(
     selected: Mapping[str, np.ndarray], road: TrackParams, waypoints: np.ndarray
 ) -> dict[str, Any]:
-    """Build the same 27 keys and `previous_progress` for n cars at once, for `reward_batch`.
+    """Build the same 27 keys, `previous_progress` and `objects_mask` for n cars at once, for `reward_batch`.
+
+    Arrays about K others have a column for each of them, none where the cars are alone.
 
     Args:
         selected: Columns of `select`, shape (n,), `closest_waypoints` (n, 2); copied.
         road: The keys that are constant on the course.
         waypoints: Those of the course as an array, (W, 2); copied.
     """
-    n = len(selected["x"])
-    return {
+    params = {
         **{key: column.copy() for key, column in selected.items()},
         "track_length": road.track_length,
         "waypoints": waypoints.copy(),
         "is_reversed": road.is_reversed,
+    }
+    return params if MASK in params else {**params, **_nobody(len(selected["x"]))}
+
+
+def _nobody(n: int) -> dict[str, np.ndarray]:
+    """Return the columns about others for n cars that are alone."""
+    return {
         "is_crashed": np.zeros(n, bool),
         "closest_objects": np.zeros((n, 2), np.int64),
-        "objects_location": [],
-        "objects_left_of_center": [],
+        "objects_location": np.zeros((n, 0, 2)),
+        "objects_left_of_center": np.zeros((n, 0), bool),
         "object_in_camera": np.zeros(n, bool),
-        "objects_speed": [],
-        "objects_heading": [],
-        "objects_distance_from_center": [],
-        "objects_distance": [],
+        "objects_speed": np.zeros((n, 0)),
+        "objects_heading": np.zeros((n, 0)),
+        "objects_distance_from_center": np.zeros((n, 0)),
+        "objects_distance": np.zeros((n, 0)),
+        MASK: np.zeros((n, 0), bool),
     }

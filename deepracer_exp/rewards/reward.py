@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from deepracer_exp.errors import BadInput, RunFailed
 
 from .guard import CtrlC, DeadlinePassed, Guard, Misconduct
-from .params import TrackParams, batch_params, rows, scalar_params, select
+from .params import TrackParams, batch_params, object_rows, rows, scalar_params, select
 from .prints import RewardPrints
 from .source import RewardSource, source_with_constants
 
@@ -114,7 +114,8 @@ class RewardFunction:
         A module with `reward_batch` takes any number of cars.
 
         Args:
-            columns: `params.BATCH_COLUMNS`, each (n_cars,), `closest_waypoints` (n_cars, 2).
+            columns: `params.BATCH_COLUMNS`, each (n_cars,), `closest_waypoints` (n_cars, 2), and with others on the
+                road `params.OBJECT_COLUMNS`.
             track_params: Params that are constant on each of the courses.
             active: Cars to reward, shape (n_cars,); None: all.
             track_index: Index in `track_params` of each car's course, shape (n_cars,); None: all drive on the first.
@@ -173,10 +174,11 @@ class RewardFunction:
         functions = self.functions
         rewards: list[float] = []
         table, own_params = list(rows(selected)), [track_params[place] for place in track_of.tolist()]
+        others = list(object_rows(selected))
         try:
             with Guard(self.time_limit_s):
-                for car, road, row in zip(cars, own_params, table, strict=True):
-                    reward = functions[car](scalar_params(row, road))
+                for car, road, row, objects in zip(cars, own_params, table, others, strict=True):
+                    reward = functions[car](scalar_params(row, road, objects))
                     # A float within the bounds needs no further check; NaN fails the comparison.
                     if type(reward) is not float or not -MAX_REWARD <= reward <= MAX_REWARD:
                         reward = _as_reward(reward)
@@ -186,7 +188,7 @@ class RewardFunction:
         except BaseException as error:  # noqa: BLE001 - raised again as one of ours
             # There is a reward for each car so far; the time limit may be exceeded right after the last one.
             failed = min(len(rewards), len(cars) - 1)
-            self._fail(error, cars[failed], scalar_params(table[failed], own_params[failed]))
+            self._fail(error, cars[failed], scalar_params(table[failed], own_params[failed], others[failed]))
         return rewards
 
     def _call_batch(
@@ -220,8 +222,9 @@ class RewardFunction:
         bad = np.flatnonzero(~(np.abs(rewards) <= MAX_REWARD))
         if len(bad):
             row, road = list(rows(selected))[bad[0]], track_params[track_of[bad[0]]]
+            objects = list(object_rows(selected))[bad[0]]
             no_reward = Unusable(_no_reward(float(rewards[bad[0]])))
-            self._fail(no_reward, cars[bad[0]], scalar_params(row, road))
+            self._fail(no_reward, cars[bad[0]], scalar_params(row, road, objects))
         return rewards
 
     def _fail(self, error: BaseException, car: int | None, params: dict[str, Any]) -> NoReturn:

@@ -20,6 +20,10 @@ METRICS: Mapping[str, tuple[str, str]] = {
     ),
     "eval_laps": ("race/laps", "number of these"),
     "eval_laps_tried": ("race/laps_tried", "number of laps tried on usual conditions"),
+    "eval_crash_free": (
+        "race/crash_free",
+        "share of its laps on usual conditions that were completed without running into a box or bot (0 to 1)",
+    ),
     "eval_zigzag_per_m": (
         "race/zigzag_per_m",
         "changes of steering from one side to the other a metre of straight, usual conditions",

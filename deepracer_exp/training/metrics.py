@@ -300,7 +300,7 @@ NOT_EVALUATED: dict[str, float | None] = dict.fromkeys(EVAL_COLUMNS)
 
 
 def eval_columns(evaluation: Evaluation) -> dict[str, float | None]:
-    """Return the columns of an evaluation in metrics.jsonl: `EVAL_COLUMNS`."""
+    """Return the columns of an evaluation in metrics.jsonl: `EVAL_COLUMNS`, and among others `eval_crash_free`."""
     usual = evaluation.on(USUAL)
     held_out = evaluation.on(HELD_OUT) if HELD_OUT in evaluation.conditions else None
     return {
@@ -312,4 +312,5 @@ def eval_columns(evaluation: Evaluation) -> dict[str, float | None]:
         "eval_lap_time_s": usual.mean_lap_time_s,
         "eval_race_score_s": evaluation.race_score_s,
         **zigzag_columns(usual),
+        **({"eval_crash_free": usual.crash_free_share} if evaluation.among_others else {}),
     }

@@ -111,8 +111,8 @@ def test_each_key_is_used_or_named_with_the_reason(drfc):
 @pytest.mark.parametrize(
     ("key", "value", "word"),
     [
-        ("DR_RACE_TYPE", "OBJECT_AVOIDANCE", "races with others are not built yet"),
-        ("DR_RACE_TYPE", "head_to_bot", "races with others are not built yet"),
+        ("DR_RACE_TYPE", "OBJECT_AVOIDANCE", "the car drives alone"),
+        ("DR_RACE_TYPE", "head_to_bot", "the car drives alone"),
         ("DR_ENABLE_DOMAIN_RANDOMIZATION", "True", "randomization=sim2real"),
         ("DR_LOCAL_S3_PRETRAINED", "True", "the training starts fresh"),
     ],

@@ -21,7 +21,7 @@ FILES = [(path.parent.name, path.stem) for group in groups() for path in (conf_d
 # Worlds differ in nothing but their names; two stand for those without a file.
 EVERY_OPTION = [*sorted(FILES), ("track", "Oval_track"), ("track", "2022_reinvent_champ_cw")]
 EXPERIMENTS = options("experiment")
-DRIVEN = ("track", "car", "action_space", "observation", "randomization", "episode", "reward")
+DRIVEN = ("track", "race", "car", "action_space", "observation", "randomization", "episode", "reward")
 
 
 @cache
@@ -30,6 +30,7 @@ def composed(group: str, name: str) -> tuple[Experiment, Composition]:
     reads = "features" if name.startswith("mlp") else "lidar" if name == "lidar" else "camera"
     sees = [f"observation={reads}"] if group == "network" else []
     teacher = ["teacher=a_run"] if name == "distill" else []
+    sees += ["observation.next_objects=2"] if group == "race" else []
     return compose_experiment([*sees, *teacher, f"{group}={name}"])
 
 

@@ -16,8 +16,8 @@ def drive(config, story, closed=True):
     for status, progress in story:
         if not race.running[0]:
             break
-        _, put_back_at = race.step(np.array([STATUS_CODE[status]]), np.array([float(progress)]))
-        backs += put_back_at.tolist()
+        back = race.step(np.array([STATUS_CODE[status]]), np.array([float(progress)]))
+        backs += back.percent.tolist()
     return race, backs
 
 
@@ -109,3 +109,25 @@ def test_after_a_lap_of_an_open_course_the_car_is_put_at_its_start(protocol):
 def test_the_penalties_of_the_virtual_race_are_those_of_the_service(protocol):
     penalty = protocol("aws_virtual").penalty_s
     assert {name: getattr(penalty, name) for name in PENALTY_S} == PENALTY_S
+
+
+def test_among_others_a_penalty_passes_in_simulated_time(protocol):
+    config = protocol("object_avoidance")
+    race = RaceProtocol(config, np.array([True]), STEP_S, among_others=True)
+
+    def step(status, progress):
+        return race.step(np.array([STATUS_CODE[status]]), np.array([float(progress)]))
+
+    step("in_progress", 10)
+    back = step("crashed", 20)
+    assert (back.cars.tolist(), back.crashed.tolist(), back.restarts.tolist()) == ([0], [True], [False])
+    assert back.hold_s.tolist() == [config.penalty_s.crashed] == [5.0]
+    for _ in range(10):
+        assert not len(step("pause", 15).cars)
+    step("lap_complete", 100)
+    (attempt,) = race.attempts
+    assert attempt.complete
+    assert not attempt.crash_free
+    assert (attempt.crashes, attempt.resets, attempt.penalty_s) == (1, 1, 5.0)
+    # Thirteen steps, ten of them the penalty; nothing is added to the clock.
+    assert attempt.time_s == 13 * STEP_S

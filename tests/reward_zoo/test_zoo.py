@@ -94,6 +94,29 @@ def anywhere(road: str, n: int) -> tuple[dict[str, np.ndarray], list[TrackParams
     return {**columns, "closest_waypoints": pairs}, track_params
 
 
+def among_others(columns: dict[str, np.ndarray], length_m: float) -> dict[str, np.ndarray]:
+    """Add three objects around each car to columns, the next one often in its way."""
+    n = len(columns["x"])
+    random = np.random.default_rng(n)
+    own = columns["distance_from_center"] * np.where(columns["is_left_of_center"], 1, -1)
+    offset = random.uniform(-0.4, 0.4, (n, 3))
+    offset[:, 1] = own + random.uniform(-0.5, 0.5, n)
+    gap_m = np.column_stack([-random.random(n), 2 * random.random(n), 2.5 + random.random(n)])
+    return {
+        **columns,
+        "is_crashed": random.random(n) < 0.2,
+        "closest_objects": np.tile([0, 1], (n, 1)),
+        "objects_location": random.uniform(-5, 5, (n, 3, 2)),
+        "objects_left_of_center": offset > 0,
+        "object_in_camera": random.random(n) < 0.5,
+        "objects_speed": random.choice([0.0, 0.75], (n, 3)),
+        "objects_heading": random.uniform(-180, 180, (n, 3)),
+        "objects_distance_from_center": np.abs(offset),
+        "objects_distance": (columns["projection_distance"][:, None] + gap_m) % length_m,
+        "objects_mask": np.ones((n, 3), bool),
+    }
+
+
 def zoo(name: str, n_cars: int, scalar: bool = False, **constants: float) -> RewardFunction:
     config = RewardConfig(name=name, file=None, constants=constants, time_limit_s=30.0)
     source = load_reward_source(config)
@@ -119,11 +142,13 @@ def test_every_reward_is_finite_in_every_state(name: str, road: str) -> None:
     assert np.abs(rewards).max() < 1e4
 
 
-@pytest.mark.parametrize("road", ROADS)
+@pytest.mark.parametrize("road", [*ROADS, "oval among others"])
 @pytest.mark.parametrize("name", zoo_names())
 def test_the_batch_formula_is_the_scalar_formula(name: str, road: str) -> None:
     n = 4 if name == "racing_line" else 200  # each car's module works the line out again
-    columns, track_params = anywhere(road, n)
+    columns, track_params = anywhere(road.split()[0], n)
+    if road.endswith("others"):
+        columns = among_others(columns, track_params[0].track_length)
     batch, scalar = zoo(name, n), zoo(name, n, scalar=True)
     # The step before, too, for what remembers it; half of the cars begin an episode after it.
     progress = columns["progress"] - np.arange(n) / n
@@ -191,6 +216,7 @@ def test_every_reward_says_what_it_teaches_and_when_it_fails(name: str) -> None:
 def test_every_constant_has_an_effect(name: str) -> None:
     columns, track_params = anywhere("corner", 200)
     columns = {**columns, "previous_progress": 0.9 * columns["progress"]}
+    columns = among_others(columns, track_params[0].track_length)
 
     def rewards(**changed: float) -> np.ndarray:
         return zoo(name, 200, **changed)(columns, track_params, None)

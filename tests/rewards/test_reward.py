@@ -20,8 +20,10 @@ from deepracer_exp.rewards.guard import Guard
 from deepracer_exp.rewards.params import (
     BATCH_COLUMNS,
     COLUMNS,
+    OBJECT_COLUMNS,
     TrackParams,
     batch_params,
+    object_rows,
     rows,
     scalar_params,
     select,
@@ -91,10 +93,32 @@ def test_batch_params_hold_the_same_keys_and_values_and_the_progress_before() ->
     batch = batch_params(selected, ROAD[0], np.array(WAYPOINTS))
     for car, row in enumerate(rows(selected)):
         for key, value in scalar_params(row, ROAD[0]).items():
-            shared = key in TrackParams._fields or key.startswith("objects_")
-            np.testing.assert_array_equal(batch[key] if shared else batch[key][car], value)
-    assert set(batch) == set(KEYS) | {"previous_progress"}
+            here = batch[key] if key in TrackParams._fields else batch[key][car]
+            np.testing.assert_array_equal(here, np.reshape(value, here.shape) if value == [] else value)
+    assert set(batch) == set(KEYS) | {"previous_progress", "objects_mask"}
     np.testing.assert_array_equal(batch["previous_progress"], np.arange(3))
+    assert {value.shape[1] for key, value in batch.items() if key.startswith("objects_")} == {0}
+
+
+def test_params_about_others_are_lists_for_one_car_and_arrays_for_many() -> None:
+    n, count = 3, 4
+    flags = ("is_crashed", "object_in_camera", "objects_left_of_center", "objects_mask")
+    sizes = {"is_crashed": (n,), "object_in_camera": (n,), "closest_objects": (n, 2)}
+    random, given = np.random.default_rng(0), {}
+    for key in (*OBJECT_COLUMNS, "objects_mask"):
+        shape = (n, count, 2) if key == "objects_location" else sizes.get(key, (n, count))
+        given[key] = random.random(shape) < 0.5 if key in flags else random.random(shape)
+    given["closest_objects"] = np.array([[0, 1], [2, 3], [3, 0]])
+    selected = select({**columns(n), **given}, np.array([0, 2]))
+    batch = batch_params(selected, ROAD[0], np.array(WAYPOINTS))
+    for place, (row, objects) in enumerate(zip(rows(selected), object_rows(selected), strict=True)):
+        params = scalar_params(row, ROAD[0], objects)
+        assert {key: type(value) for key, value in params.items()} == KEYS
+        assert type(params["closest_objects"][0]) is int
+        for key in OBJECT_COLUMNS:
+            np.testing.assert_array_equal(batch[key][place], params[key])
+            np.testing.assert_array_equal(params[key], given[key][2 * place])
+    assert batch["objects_mask"].shape == (2, count)
 
 
 def test_cars_that_are_not_active_get_nothing_and_are_not_called() -> None:
@@ -420,7 +444,7 @@ def test_a_bad_batch_fails_the_run_in_one_line(body: str, car: int | None, messa
     assert str(error).startswith(f"reward mine: reward_batch {message}")
     assert error.car == car
     assert error.params is not None
-    assert set(error.params) == set(KEYS) | ({"previous_progress"} if car is None else set())
+    assert set(error.params) == set(KEYS) | ({"previous_progress", "objects_mask"} if car is None else set())
     if car is not None:
         assert error.params["x"] == float(car)
         assert str(error).endswith(f"(car {car}, step 7)")

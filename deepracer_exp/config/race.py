@@ -1,0 +1,99 @@
+"""The race: alone, among boxes, among bots, or both (`conf/race/`); numbers decide, as on the service."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from .bounds import NonNegative, Positive
+from .driving import Range
+
+Number = Annotated[int, Field(ge=0, le=20)]
+Share = Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)]
+BotSpeed = Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)]
+
+LANES = ("inner", "outer")
+"""Names of the lanes; the position is the lane's number."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoxPosition:
+    """Where a box stands."""
+
+    lap: Share
+    lane: Literal["inner", "outer"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoxesConfig:
+    """Boxes on the road."""
+
+    number: Number
+    placement: Literal["random", "alternating", "fixed"]
+    positions: Annotated[tuple[BoxPosition, ...], Field(max_length=20)]
+    min_distance_m: NonNegative
+
+    def __post_init__(self) -> None:
+        """Refuse positions without the placement that uses them, and the placement without positions."""
+        if self.positions and self.placement != "fixed":
+            raise ValueError(
+                f"positions are used by placement=fixed only, and placement={self.placement}; accepted: "
+                "placement=fixed, or positions=[]"
+            )
+        if self.placement == "fixed" and not self.positions:
+            raise ValueError(
+                "placement=fixed without positions; accepted: positions=[{lap: 0.25, lane: inner}]"
+            )
+
+    @property
+    def count(self) -> int:
+        """Return how many boxes there are."""
+        return len(self.positions) if self.placement == "fixed" else self.number
+
+
+@dataclass(frozen=True, kw_only=True)
+class BotsConfig:
+    """Cars of the service's that follow the lanes at a constant speed."""
+
+    number: Number
+    placement: Literal["random", "alternating"]
+    min_distance_m: NonNegative
+    speed_mps: BotSpeed
+    lane_change_after_s: Range[NonNegative] | None
+    lane_change_distance_m: Positive
+    pause_s: NonNegative
+
+    @property
+    def count(self) -> int:
+        """Return how many bots there are."""
+        return self.number
+
+
+@dataclass(frozen=True, kw_only=True)
+class RaceConfig:
+    """The others on the track."""
+
+    boxes: BoxesConfig
+    bots: BotsConfig
+    quirks: Literal["fixed", "service"]
+
+    @property
+    def others(self) -> int:
+        """Return how many boxes and bots there are."""
+        return self.boxes.count + self.bots.count
+
+
+ALONE = RaceConfig(
+    boxes=BoxesConfig(number=0, placement="random", positions=(), min_distance_m=2.0),
+    bots=BotsConfig(
+        number=0,
+        placement="alternating",
+        min_distance_m=2.0,
+        speed_mps=0.75,
+        lane_change_after_s=None,
+        lane_change_distance_m=1.0,
+        pause_s=2.0,
+    ),
+    quirks="fixed",
+)
+"""The race of runs that were stored before there were others."""

@@ -1,0 +1,371 @@
+"""Boxes and bots in a race: where they begin, whom a crash is blamed on, and what cars and reward functions see."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepracer_exp.config.race import BotsConfig, BoxesConfig, RaceConfig
+from deepracer_exp.sim.others import END_M, Others, closest, next_ones
+from deepracer_exp.tracks.lanes import INNER, OUTER, Lanes
+from deepracer_exp.tracks.track import Pose
+
+from .observation import OTHERS
+from .randomization import CarStreams, Purpose
+from .rules import Bools, Ids, RaceRules, StepResult, lap_clock_s
+from .setup import RaceSetup
+from .state import Floats, Measures, checked_array
+from .trace import STATUS_CODE
+
+NEAR_M = 1.0
+"""Along the lap: a car that would start nearer to another than this starts in the other lane."""
+BEHIND_BOX_M = 1.0
+"""A car that has run into a box is put back so far before it."""
+BESIDE_M = 0.6
+"""An other counts as ahead until its origin is so far behind the car's front, so that the rear has passed it, too."""
+_SIZE_M = {False: (0.40, 0.30, 0.25), True: (0.324, 0.188, 0.211)}
+"""Length, width and height of boxes and, True, bots (deepracer-simapp, models/box_obstacle and models/bot_car)."""
+_COLOR = {False: (123, 97, 79), True: (40, 40, 40)}
+"""Red, green and blue of the same."""
+_GIVES_WAY = np.isin(
+    np.arange(len(STATUS_CODE)),
+    [STATUS_CODE[status] for status in ("in_progress", "off_track", "immobilized", "reversed")],
+)
+"""Statuses that a crash takes the place of; the end of a lap and of the time come first."""
+_VIEW = np.tan(0.5 * 1.13)
+"""Tangent of half the horizontal angle of view, of which 480/640 is visible vertically (deepracer-simapp,
+cameras/frustum.py)."""
+_EYE_M, _EYE_PITCH_RAD, _NEAREST_M = (0.14529379, 0.13032555), 0.2618, 0.2
+"""The camera ahead of and above the origin, its pitch, and the distance from which it sees (the same file)."""
+
+
+class RaceOthers:
+    """The others of N cars under the service's rules.
+
+    Attributes:
+        others: where they are.
+        held: cars that serve a penalty, (N,), bool: they stand, no rule is applied, and bots drive on.
+    """
+
+    def __init__(self, race: RaceConfig, setup: RaceSetup, rules: RaceRules):
+        """Set up; call `seed` and then `begin` next.
+
+        Args:
+            race: how many others there are, and where.
+            setup: of the race.
+            rules: of the same cars.
+        """
+        self._race, self._rules = race, rules
+        tracks = [track for course in setup.courses for track in course.tracks]
+        self.lanes = Lanes(tracks)
+        self.others = Others(race, self.lanes, rules.tracks, rules.n_cars)
+        self._inner_is_left = np.array([not track.is_clockwise for track in tracks])
+        self._period_s = setup.car.control_period_s
+        self._front_m = setup.car.front_point_m
+        self._observation = setup.observation
+        self._speed_scale_mps = setup.observation.speed_scale_mps
+        self._held_until = np.zeros(rules.n_cars, np.int64)
+        self._in_bot = np.zeros(rules.n_cars, bool)
+        self.held = np.zeros(rules.n_cars, bool)
+        self._fixed_m = np.array([position.lap for position in race.boxes.positions])
+        self._fixed_lane = np.array(
+            [INNER if position.lane == "inner" else OUTER for position in race.boxes.positions], np.int64
+        )
+        looks = [(*_SIZE_M[bot], *_COLOR[bot]) for bot in self.others.is_bot.tolist()]
+        self._looks = np.array(looks, np.float32)
+
+    def seed(self, seed: int) -> None:
+        """Start all streams from `seed`."""
+        self._streams = CarStreams(seed, self._rules.cars.tolist(), Purpose.OTHERS)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return copies of everything the next steps depend on."""
+        return {**self.others.state_dict(), "held_until": self._held_until.copy()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore a `state_dict`.
+
+        Raises:
+            BadInput: it is of other numbers of cars, boxes or bots.
+        """
+        own = self.state_dict()
+        checked = {name: checked_array(state, name, values.shape) for name, values in own.items()}
+        self.others.load_state_dict(checked)
+        self._held_until = checked["held_until"]
+
+    def begin(self, ids: Ids, pose: Pose, evaluated: bool) -> Pose:
+        """Place the others of new episodes and return where the cars start, in another lane where one is near.
+
+        Args:
+            ids: indices of the cars, (n,).
+            pose: where they would start, on the centre line, (n,) each.
+            evaluated: whether the start is that of an evaluation, where the service looks for nobody.
+        """
+        self._held_until[ids] = 0
+        first = self._rules.episode[ids] <= 0
+        if self._race.quirks == "fixed":
+            self._place(ids)
+            return self._beside(ids, pose, np.ones(len(ids), bool))
+        # The service looks at the others of the episode before.
+        self._place(ids[first])
+        pose = self._beside(ids, pose, np.full(len(ids), not evaluated))
+        self._place(ids[~first])
+        return pose
+
+    def judge(
+        self, result: StepResult, time_s: Floats | None = None
+    ) -> tuple[StepResult, dict[str, np.ndarray]]:
+        """Apply the rules about others to the result of a step, and move the bots.
+
+        Cars and reward function meet the bots where they were sent in the step before; who is ahead in a crash is
+        decided by where they are now, as on the service (deepracer-simapp, agent_ctrl/rollout_agent_ctrl.py and
+        environments/deepracer_racetrack_env.py).
+
+        Args:
+            result: of the step without others.
+            time_s: since each episode's begin, (N,), as a recording has it; None: by the count of control steps.
+
+        Returns:
+            The result with crashes, and the columns `rewards.params.OBJECT_COLUMNS`, one row per car.
+        """
+        rules, others, now = self._rules, self.others, result.now
+        self.held = rules.steps <= self._held_until
+        running = result.running & ~self.held
+        time_s = lap_clock_s(rules.steps, self._period_s) if time_s is None else time_s
+        hit = others.hit(now.x_m, now.y_m, now.yaw_rad)
+        columns = self._columns(now, time_s)
+        others.drive(rules.track_index, time_s, rules.steps > 1)
+        has_hit = (hit >= 0) & running
+        self._in_bot = has_hit & others.is_bot[hit]
+        behind, ahead = self._who_is_behind(has_hit, hit, result.progress)
+        others.pause(ahead, time_s)
+        status = with_crashes(result.status, has_hit, behind)
+        status[self.held] = STATUS_CODE["pause"]
+        rules.rest(np.flatnonzero(self.held))
+        columns["is_crashed"] = has_hit & (status > STATUS_CODE["in_progress"])
+        terminated, truncated = rules.ends(status)
+        judged = replace(result, running=running, status=status, terminated=terminated, truncated=truncated)
+        return judged, columns
+
+    def put_back(self, ids: Ids, pose: Pose, percent: Floats, crashed: Bools, hold_s: Floats) -> Pose:
+        """Return where cars continue in the middle of their episodes, and hold them there.
+
+        A car that has run into a bot stays where it is; one near a box continues 1 m before it in the other lane
+        (deepracer-simapp, agent_ctrl/rollout_agent_ctrl.py: `_get_car_reset_model_state`).
+
+        Args:
+            ids: indices of the cars, (n,).
+            pose: where they would continue without others, (n,) each.
+            percent: progress at which they would, (n,).
+            crashed: whether they have crashed, (n,).
+            hold_s: how long each is held there, (n,).
+        """
+        rules, others = self._rules, self.others
+        self._held_until[ids] = rules.steps[ids] + np.round(hold_s / self._period_s).astype(np.int64)
+        now, track_index = rules.now, rules.track_index[ids]
+        length_m = rules.tracks.length_m[track_index]
+        boxes = self._race.boxes.count
+        x, y, yaw_rad = (part.copy() for part in pose)
+        stays = crashed & self._in_bot[ids]
+        if boxes:
+            at_m = np.mod(percent / 100 + rules.start_ndist[ids], 1.0) * length_m
+            away_m = _around(others.distance_m[ids, :boxes] - at_m[:, None], length_m[:, None])
+            nearest = np.abs(away_m).argmin(axis=1)
+            in_box = ~stays & (np.abs(away_m[np.arange(len(ids)), nearest]) < NEAR_M)
+            box_m = others.distance_m[ids, nearest]
+            before = rules.tracks.points_at((box_m - BEHIND_BOX_M) / length_m, track_index)
+            lane = self._other_lane(track_index, others.offset_m[ids, nearest])
+            for part, found in zip((x, y, yaw_rad), self.lanes.poses(before, lane, track_index), strict=True):
+                part[in_box] = found[in_box]
+        for part, here in zip((x, y, yaw_rad), (now.x_m, now.y_m, now.yaw_rad), strict=True):
+            part[stays] = here[ids][stays]
+        return Pose(x, y, yaw_rad)
+
+    def features(self, ids: Ids, now: Measures) -> NDArray[np.float32]:
+        """Return the features of the next others of the cars `ids`, (n, next_objects * len(OTHERS)), about -1..1.
+
+        For each: `gap` from the car's front to its origin along the lap over `next_objects_reach_m`, below 0 beside the
+        car; `side`, how far it is to the left of the car across the road, over half the road's width; `closing` speed
+        over `speed_scale_mps`; `bot`, 1 for a bot and 0 for a box. One beyond the reach, or none: 1, 0, 0, 0.
+        """
+        count, reach_m = self._observation.next_objects, self._observation.next_objects_reach_m
+        others, rules = self.others, self._rules
+        track_index = rules.track_index[ids]
+        length_m = rules.tracks.length_m[track_index]
+        out = np.zeros((len(ids), count, len(OTHERS)), np.float32)
+        found, gap_m = next_ones(others.distance_m[ids], now.ndist * length_m, length_m, count, BESIDE_M)
+        near = (found >= 0) & (gap_m < reach_m)
+        car = np.arange(len(ids))[:, None]
+        speed_mps = others.speeds_mps(lap_clock_s(rules.steps, self._period_s))[ids]
+        side_m = others.offset_m[ids][car, found] - now.offset_m[:, None]
+        closing_mps = now.speed_mps[:, None] - speed_mps[car, found]
+        out[..., 0] = np.where(near, gap_m / reach_m, 1.0)
+        out[..., 1] = np.where(near, np.clip(2 * side_m / now.track_width_m[:, None], -2, 2), 0.0)
+        out[..., 2] = np.where(near, closing_mps / self._speed_scale_mps, 0.0)
+        out[..., 3] = near & others.is_bot[found]
+        return out.reshape(len(ids), count * len(OTHERS))
+
+    def boxes(self, ids: Ids) -> NDArray[np.float32]:
+        """Return what cameras and LIDARs see of the others of the cars `ids`, (n, K, 9); see `camera.take_pictures`."""
+        poses = self.others.poses[ids].astype(np.float32)
+        looks = np.broadcast_to(self._looks, (*poses.shape[:2], self._looks.shape[1]))
+        return np.concatenate([poses, looks], axis=-1)
+
+    def _place(self, ids: Ids) -> None:
+        """Draw where the others of new episodes are, and put them there."""
+        rules, race = self._rules, self._race
+        track_index = rules.track_index[ids]
+        boxes, bots = race.boxes.count, race.bots.count
+        places_m, lanes = np.zeros((len(ids), boxes + bots)), np.zeros((len(ids), boxes + bots), np.int64)
+        seeds = np.zeros(len(ids), np.uint64)
+        for row, car in enumerate(ids.tolist()):
+            length_m, episode = float(rules.tracks.length_m[track_index[row]]), int(rules.episode[car])
+            stream = self._streams.stream(car, episode)
+            seeds[row] = stream.integers(2**63)
+            if race.boxes.placement == "fixed":
+                places_m[row, :boxes], lanes[row, :boxes] = self._fixed_m * length_m, self._fixed_lane
+            else:
+                least_m = self._least_m(length_m, episode)
+                places_m[row, :boxes], lanes[row, :boxes] = _placed(race.boxes, least_m, length_m, stream)
+            places_m[row, boxes:], lanes[row, boxes:] = _placed(
+                race.bots, race.bots.min_distance_m, length_m, stream
+            )
+        self.others.place(ids, track_index, places_m, lanes, seeds)
+
+    def _least_m(self, length_m: float, episode: int) -> float:
+        """Return the least distance between boxes in an episode.
+
+        The service takes its number for per cent of the lap, and applies that to its own result at every placement, of
+        which there is one more than episodes (deepracer-simapp, agent_ctrl/obstacles_agent_ctrl.py).
+        """
+        least = self._race.boxes.min_distance_m
+        if self._race.quirks == "fixed":
+            return least
+        return min(least * (length_m / 100) ** (episode + 2), length_m)
+
+    def _beside(self, ids: Ids, pose: Pose, checked: Bools) -> Pose:
+        """Return start poses in the lane opposite to the nearest other where one is near, (n,) each."""
+        rules, others = self._rules, self.others
+        track_index = rules.track_index[ids]
+        length_m = rules.tracks.length_m[track_index, None]
+        away_m = others.distance_m[ids] - rules.start_ndist[ids, None] * length_m
+        # The service does not see across the start line.
+        away_m = _around(away_m, length_m) if self._race.quirks == "fixed" else away_m
+        nearest = np.abs(away_m).argmin(axis=1)
+        row = np.arange(len(ids))
+        near = np.flatnonzero(checked & (np.abs(away_m[row, nearest]) < NEAR_M))
+        if len(near):
+            lane = self._other_lane(track_index[near], others.offset_m[ids[near], nearest[near]])
+            points = np.stack([pose.x, pose.y], axis=-1)[near]
+            pose = Pose(*(part.copy() for part in pose))
+            for part, found in zip(pose, self.lanes.poses(points, lane, track_index[near]), strict=True):
+                part[near] = found
+        return pose
+
+    def _other_lane(self, track_index: Ids, offset_m: Floats) -> NDArray[np.int64]:
+        """Return the lane on the other side of the centre line than something at these offsets, (n,)."""
+        return np.where((offset_m > 0) == self._inner_is_left[track_index], OUTER, INNER)
+
+    def _who_is_behind(self, has_hit: Bools, hit: NDArray[np.int64], progress: Floats) -> tuple[Bools, Bools]:
+        """Return which cars are at fault, being behind the bot or in a box, and which are ahead of the bot, (N,)."""
+        behind, ahead = has_hit & ~self._in_bot, np.zeros(len(hit), bool)
+        ids = np.flatnonzero(self._in_bot)
+        if len(ids):
+            rules = self._rules
+            x, y, yaw_rad = self.others.poses[ids, hit[ids]].T
+            fronts = np.stack(
+                [x + self._front_m * np.cos(yaw_rad), y + self._front_m * np.sin(yaw_rad)], axis=-1
+            )
+            bot = 100 * rules.tracks.project(fronts, rules.track_index[ids]).ndist
+            own = np.mod(progress[ids] + 100 * rules.start_ndist[ids], 100)
+            behind[ids], ahead[ids] = own < bot, own > bot
+        return behind, ahead
+
+    def _columns(self, now: Measures, time_s: Floats) -> dict[str, np.ndarray]:
+        """Return the params about others, one row per car; `is_crashed` is not known yet."""
+        others, rules = self.others, self._rules
+        as_service = self._race.quirks == "service"
+        bots, shape = self._race.bots.count, others.distance_m.shape
+        closest_two = closest(others.distance_m, now.ndist * rules.length_m)
+        yaw_rad = others.poses[..., 2]
+        if as_service:
+            heading = yaw_rad.copy() if bots else np.zeros(shape)
+            speed_mps = np.full(shape, self._race.bots.speed_mps if bots else 0.0)
+            # The service counts the own car as number 0 here and not there.
+            tested = closest_two[:, 1] - 1
+        else:
+            degrees = np.degrees(np.mod(yaw_rad + np.pi, 2 * np.pi) - np.pi)
+            heading, speed_mps = np.where(others.is_bot, degrees, 0.0), others.speeds_mps(time_s)
+            tested = closest_two[:, 1]
+        return {
+            "closest_objects": closest_two,
+            "objects_location": others.poses[..., :2].copy(),
+            "objects_left_of_center": others.offset_m > 0,
+            "object_in_camera": self._in_camera(now, tested),
+            "objects_speed": speed_mps,
+            "objects_heading": heading,
+            "objects_distance_from_center": np.abs(others.offset_m),
+            "objects_distance": others.distance_m.copy(),
+            "objects_mask": np.ones(shape, bool),
+        }
+
+    def _in_camera(self, now: Measures, tested: NDArray[np.int64]) -> Bools:
+        """Return whether an other's origin or a corner of its crash rectangle is in the camera's view, (N,).
+
+        Nothing hides anything. -1 is no other.
+        """
+        row = np.arange(len(tested))
+        poses, half_m = self.others.poses[row, tested], self.others.half_m[tested]
+        cos, sin = np.cos(poses[:, 2, None]), np.sin(poses[:, 2, None])
+        along = half_m[:, :1] * np.array([0, 1, 1, -1, -1])
+        across = half_m[:, 1:] * np.array([0, 1, -1, -1, 1])
+        dx = poses[:, :1] + cos * along - sin * across - now.x_m[:, None]
+        dy = poses[:, 1:2] + sin * along + cos * across - now.y_m[:, None]
+        cos, sin = np.cos(now.yaw_rad)[:, None], np.sin(now.yaw_rad)[:, None]
+        ahead, left = cos * dx + sin * dy - _EYE_M[0], cos * dy - sin * dx
+        depth = np.cos(_EYE_PITCH_RAD) * ahead + np.sin(_EYE_PITCH_RAD) * _EYE_M[1]
+        down = np.sin(_EYE_PITCH_RAD) * -ahead + np.cos(_EYE_PITCH_RAD) * _EYE_M[1]
+        seen = (depth > _NEAREST_M) & (np.abs(left) < _VIEW * depth) & (np.abs(down) < 0.75 * _VIEW * depth)
+        return np.asarray(seen.any(axis=1) & (tested >= 0))
+
+
+def with_crashes(status: NDArray[np.int64], has_hit: Bools, at_fault: Bools) -> NDArray[np.int64]:
+    """Return status codes after crashes, (N,).
+
+    A car at fault has crashed. One that is not drives on, and leaving the road, driving backwards or standing in that
+    step does not count either. The end of a lap and of the time have priority (deepracer-simapp,
+    agent_ctrl/rollout_agent_ctrl.py: `_check_for_episode_termination`).
+
+    Args:
+        status: codes of `env.trace.STATUS_CODE` without crashes, (N,).
+        has_hit: which cars have run into another, (N,).
+        at_fault: which of them are at fault, (N,).
+    """
+    outcome = np.where(at_fault, STATUS_CODE["crashed"], STATUS_CODE["in_progress"])
+    return np.where(has_hit & _GIVES_WAY[status], outcome, status)
+
+
+def _placed(
+    config: BoxesConfig | BotsConfig, least_m: float, length_m: float, stream: np.random.Generator
+) -> tuple[Floats, NDArray[np.int64]]:
+    """Return places along the lap and lanes, (count,) each, as the service draws them.
+
+    At random, each in turn is moved to anywhere between its neighbours that keeps the least distance.
+    """
+    count = config.count
+    places_m = np.linspace(least_m, length_m - END_M, count)
+    if config.placement != "random":
+        return places_m, np.arange(count) % 2
+    for index in stream.permutation(count).tolist():
+        low_m = least_m if index == 0 else places_m[index - 1] + least_m
+        high_m = length_m - END_M if index == count - 1 else places_m[index + 1] - least_m
+        if low_m < high_m:
+            places_m[index] = stream.uniform(low_m, high_m)
+    return places_m, stream.integers(2, size=count)
+
+
+def _around(away_m: Floats, length_m: Floats) -> Floats:
+    """Return distances along a lap the shorter way round."""
+    return np.mod(away_m + 0.5 * length_m, length_m) - 0.5 * length_m
