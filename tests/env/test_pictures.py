@@ -211,7 +211,7 @@ def test_a_lens_changes_no_other_draw(race_of):
         race_of(*VARIED, f"randomization.pictures.lens_k1=[{k1},{k1}]", n_cars=4) for k1 in (0, 0.1)
     )
     assert np.array_equal(plain._varied._values[:, :-1], bent._varied._values[:, :-1])
-    for name in ("_boxes", "_dirt", "_spot", "_color_factor", "_noise_at"):
+    for name in ("_boxes", "_dirt", "_spot", "_color_factor", "_noise_start"):
         assert np.array_equal(getattr(plain._varied, name), getattr(bent._varied, name))
 
 

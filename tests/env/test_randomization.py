@@ -74,7 +74,7 @@ def test_without_randomization_nothing_is_drawn(monkeypatch):
     def forbidden(*_):
         raise AssertionError("a random number was drawn")
 
-    monkeypatch.setattr(CarStreams, "at", forbidden)
+    monkeypatch.setattr(CarStreams, "stream", forbidden)
     race = race_of(n_cars=2, max_steps=5)
     trace = drive(race, random_actions(12, 2))
     np.testing.assert_array_equal(trace[:, :, DRAWN], np.broadcast_to(list(OFF.values()), (12, 2, len(OFF))))
