@@ -27,7 +27,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.config.learning import CNNConfig, MLPConfig
+from deepracer_exp.config.learning import CNNConfig, MLPConfig, PPOConfig
 from deepracer_exp.env.sb3 import DeepRacerVecEnv
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.sim.batch import cores
@@ -62,6 +62,7 @@ class Convolutions(BaseFeaturesExtractor):
 def build(experiment: Experiment, physics_threads: int, car_racing: bool = False) -> PPO:
     """Return the peer with the experiment's hyperparameters."""
     algorithm, network = experiment.algorithm, experiment.network
+    assert isinstance(algorithm, PPOConfig)
     assert algorithm.frames_per_iteration is not None
     n_cars = experiment.collector.cars
     layers: dict[str, Any]

@@ -42,7 +42,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from deepracer_exp.agents.actor_critic import build_actor_critic
+from deepracer_exp.agents.build import build_networks
 from deepracer_exp.collectors.collector import LocalCollector
 from deepracer_exp.collectors.forking import start_workers_early
 from deepracer_exp.config.compose import compose_experiment
@@ -207,7 +207,9 @@ def collecting(experiment: Experiment, rounds: int, seconds: float, folder: Path
     setup = build_setup(experiment)
     generator = torch.Generator().manual_seed(experiment.seed)
     observed = observation_shape(experiment.observation)
-    policy = build_actor_critic(experiment.network, observed, setup.actions.n, generator).policy
+    policy = build_networks(
+        experiment.network, experiment.algorithm, observed, setup.actions.n, generator
+    ).policy
 
     def start(processes: int) -> LocalCollector:
         config = dataclasses.replace(experiment.collector, mode="sync", processes=processes)

@@ -4,7 +4,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .agents.ppo import PPO, Algorithm, UpdateMetrics
+    from .agents.algorithm import Algorithm, UpdateMetrics
+    from .agents.ppo import PPO
     from .agents.schedules import Schedule
     from .api import (
         ComposedExperiment,
@@ -54,7 +55,8 @@ __all__ = [
     "train",
 ]
 _MODULES = {
-    "agents.ppo": ("PPO", "Algorithm", "UpdateMetrics"),
+    "agents.algorithm": ("Algorithm", "UpdateMetrics"),
+    "agents.ppo": ("PPO",),
     "agents.schedules": ("Schedule",),
     "env.observation": ("ObservationPart",),
     "env.race_env": ("RaceEnv",),

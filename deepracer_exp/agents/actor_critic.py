@@ -11,8 +11,15 @@ from tensordict.nn import (
     TensorDictModuleBase,
 )
 from torch import Tensor, nn
-from torch.distributions import Categorical
-from torchrl.modules import MLP, ActorValueOperator, IndependentNormal, ProbabilisticActor, ValueOperator
+from torch.distributions import Categorical, Distribution
+from torchrl.modules import (
+    MLP,
+    ActorValueOperator,
+    IndependentNormal,
+    ProbabilisticActor,
+    TanhNormal,
+    ValueOperator,
+)
 
 from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.config.learning import CNNConfig, NetworkConfig
@@ -25,14 +32,43 @@ CONTINUOUS_ACTION_SIZE = 2
 _ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU}
 
 # A policy that starts almost uniform (or centred) explores evenly; the value head starts at full scale.
-_HIDDEN_GAIN, _POLICY_GAIN, _VALUE_GAIN = math.sqrt(2), 0.01, 1.0
-_CRITIC_HIDDEN = (64, 64)
+HIDDEN_GAIN, POLICY_GAIN, VALUE_GAIN = math.sqrt(2), 0.01, 1.0
+CRITIC_HIDDEN = (64, 64)
 """Units of a value network that sees features beside a policy that sees pictures."""
-_INITIAL_STD = 0.5
+INITIAL_STD = 0.5
 """Initial standard deviation of a continuous policy on a user's network without an attribute `initial_std`."""
 
 
-class ActorCritic(nn.Module):
+class PolicyNetworks(nn.Module):
+    """A stochastic policy, beside what its algorithm needs to improve it.
+
+    Attributes:
+        trunk: What the policy shares with another network, -> `hidden`; None: it shares nothing.
+        policy_head: The policy's layers after the trunk; without a trunk, all of them.
+    """
+
+    def __init__(self, policy_head: ProbabilisticActor, trunk: TensorDictModule | None = None) -> None:
+        super().__init__()
+        self.policy_head, self.trunk = policy_head, trunk
+
+    @property
+    def policy(self) -> TensorDictModuleBase:
+        """What collectors drive with: what is seen -> `action` and `action_log_prob`; it shares these parameters.
+
+        What is seen is `observation`, or `pixels` and `lidar` where there are such sensors. It samples;
+        `set_exploration_type(ExplorationType.DETERMINISTIC)` makes it take the likeliest action. A discrete action is
+        an int64 index of shape [...], a continuous one two float32 numbers, which the environment clips to -1..1. The
+        distribution's parameters are written beside them (`logits`, or `loc` and `scale`).
+        """
+        return self.policy_head
+
+    @property
+    def in_keys(self) -> list[str]:
+        """What the networks read."""
+        raise NotImplementedError
+
+
+class ActorCritic(PolicyNetworks):
     """A stochastic policy and a state value, with separate networks or on one trunk.
 
     Attributes:
@@ -47,18 +83,12 @@ class ActorCritic(nn.Module):
         value_head: ValueOperator,
         trunk: TensorDictModule | None = None,
     ) -> None:
-        super().__init__()
-        self.policy_head, self.value_head, self.trunk = policy_head, value_head, trunk
+        super().__init__(policy_head, trunk)
+        self.value_head = value_head
 
     @property
     def policy(self) -> TensorDictModuleBase:
-        """The module that collectors drive with, from `in_keys` to `action` and `action_log_prob`.
-
-        It shares the parameters. Its input is `observation`, or `pixels` and `lidar` of such sensors. It samples;
-        `set_exploration_type(ExplorationType.DETERMINISTIC)` makes it take the likeliest action. A discrete action is
-        an int64 index of shape [...], a continuous one two unbounded float32 numbers, which the environment clips to
-        -1..1. The distribution's parameters are written beside them (`logits`, or `loc` and `scale`).
-        """
+        """As of `PolicyNetworks`; continuous actions are unbounded."""
         if self.trunk is None:
             return self.policy_head
         policy = ActorValueOperator(self.trunk, self.policy_head, self.value_head).get_policy_operator()
@@ -105,9 +135,9 @@ def build_actor_critic(
         keys = list(observed.seen)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(torch.randint(2**62, (), generator=generator)))
-            policy_network, value = (_own_network(network, observed, size) for size in (outputs, 1))
+            policy_network, value = (own_network(network, observed, size) for size in (outputs, 1))
         with reading(f"network.target={network.target}: initial_std"):
-            initial_std = float(getattr(policy_network, "initial_std", _INITIAL_STD))
+            initial_std = float(getattr(policy_network, "initial_std", INITIAL_STD))
         return ActorCritic(
             _policy(keys, policy_network, continuous, initial_std), ValueOperator(value, in_keys=keys)
         )
@@ -118,28 +148,28 @@ def build_actor_critic(
         net: nn.Module = (
             SensorNet(network, observed, outputs)
             if isinstance(network, CNNConfig)
-            else _dense(observed.features, network.hidden, network.activation, outputs)
+            else dense(observed.features, network.hidden, network.activation, outputs)
         )
-        return _initialize(net, gain, generator)
+        return initialize(net, gain, generator)
 
     if network.shared_trunk:
-        trunk = TensorDictModule(layers(None, _HIDDEN_GAIN), keys, ["hidden"])
+        trunk = TensorDictModule(layers(None, HIDDEN_GAIN), keys, ["hidden"])
 
         def head(outputs: int, gain: float) -> nn.Module:
-            return _initialize(nn.Sequential(nn.Linear(network.hidden[-1], outputs)), gain, generator)
+            return initialize(nn.Sequential(nn.Linear(network.hidden[-1], outputs)), gain, generator)
 
-        policy = _policy(["hidden"], head(outputs, _POLICY_GAIN), continuous, network.initial_std)
-        return ActorCritic(policy, ValueOperator(head(1, _VALUE_GAIN), in_keys=["hidden"]), trunk)
-    policy = _policy(keys, layers(outputs, _POLICY_GAIN), continuous, network.initial_std)
+        policy = _policy(["hidden"], head(outputs, POLICY_GAIN), continuous, network.initial_std)
+        return ActorCritic(policy, ValueOperator(head(1, VALUE_GAIN), in_keys=["hidden"]), trunk)
+    policy = _policy(keys, layers(outputs, POLICY_GAIN), continuous, network.initial_std)
     if not isinstance(network, CNNConfig) or network.critic == "pictures":
-        return ActorCritic(policy, ValueOperator(layers(1, _VALUE_GAIN), in_keys=keys))
-    critic = _dense(observed.features, _CRITIC_HIDDEN, network.activation, 1)
+        return ActorCritic(policy, ValueOperator(layers(1, VALUE_GAIN), in_keys=keys))
+    critic = dense(observed.features, CRITIC_HIDDEN, network.activation, 1)
     return ActorCritic(
-        policy, ValueOperator(_initialize(critic, _VALUE_GAIN, generator), in_keys=["observation"])
+        policy, ValueOperator(initialize(critic, VALUE_GAIN, generator), in_keys=["observation"])
     )
 
 
-def _own_network(network: OwnClass, observed: ObservationShape, outputs: int) -> nn.Module:
+def own_network(network: OwnClass, observed: ObservationShape, outputs: int) -> nn.Module:
     """Build a network of the user's own and call a copy of it, with two observations."""
     # The number itself where an input has only one axis.
     inputs = [shape if len(shape) > 1 else shape[0] for shape in observed.seen.values()]
@@ -157,7 +187,7 @@ def _own_network(network: OwnClass, observed: ObservationShape, outputs: int) ->
     return built
 
 
-def _dense(inputs: int, hidden: tuple[int, ...], activation: str, outputs: int | None = None) -> MLP:
+def dense(inputs: int, hidden: tuple[int, ...], activation: str, outputs: int | None = None) -> MLP:
     """Return a perceptron; without `outputs` its last hidden layer is the output."""
     *before, last = hidden if outputs is None else (*hidden, outputs)
     return MLP(
@@ -177,11 +207,17 @@ class SensorNet(nn.Module):
     instructions for it (updates are 1.7 to 2.4 times as fast with AVX-512 BF16, three times with AMX).
     """
 
-    def __init__(self, config: CNNConfig, observed: ObservationShape, outputs: int | None) -> None:
-        """Build the layers; without `outputs` the last hidden layer is the output."""
+    def __init__(
+        self, config: CNNConfig, observed: ObservationShape, outputs: int | None, actions: int = 0
+    ) -> None:
+        """Build the layers; without `outputs` the last hidden layer is the output.
+
+        With `actions`, so many numbers follow the sensors as the last input and join them, as a critic needs it.
+        """
         super().__init__()
         activation = config.activation
         size, hidden = 0, config.hidden
+        self.has_action = actions > 0
         self.has_picture, self.has_lidar = observed.picture is not None, observed.lidar is not None
         self.half_precision: bool = self.has_picture and torch.cpu._is_avx512_bf16_supported()
         if observed.picture is not None:
@@ -200,13 +236,16 @@ class SensorNet(nn.Module):
         if observed.lidar is not None:
             if config.lidar_joins_after:
                 alone, hidden = hidden[: config.lidar_joins_after], hidden[config.lidar_joins_after :]
-                self.embedder, size = _dense(size, alone, activation), alone[-1]
-            self.lidar = _dense(observed.lidar, config.lidar_hidden, activation)
+                self.embedder, size = dense(size, alone, activation), alone[-1]
+            self.lidar = dense(observed.lidar, config.lidar_hidden, activation)
             size += config.lidar_hidden[-1]
-        self.perceptron = _dense(size, hidden, activation, outputs)
+        self.perceptron = dense(size + actions, hidden, activation, outputs)
 
     def forward(self, *sensed: Tensor) -> Tensor:
         """Return the outputs."""
+        actions = []
+        if self.has_action:
+            sensed, actions = sensed[:-1], [sensed[-1].reshape(-1, sensed[-1].shape[-1])]
         batch = sensed[-1].shape[:-1] if self.has_lidar else sensed[0].shape[:-3]
         half = self.has_picture and (self.half_precision or sensed[0].is_cuda)
         parts = []
@@ -219,6 +258,7 @@ class SensorNet(nn.Module):
                 )
                 pictures = (pictures / 255).contiguous(memory_format=torch.channels_last)
                 parts.insert(0, self.embedder(self.convolutions(pictures).flatten(1)))
+            parts += actions
             outputs = self.perceptron(parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1))
         return outputs.float().reshape(*batch, -1)
 
@@ -248,18 +288,22 @@ class Attention(nn.Module):
 def _policy(
     in_keys: list[str], layers: nn.Module, continuous: bool, initial_std: float
 ) -> ProbabilisticActor:
-    if continuous:
-        scale = AddStateIndependentNormalScale(CONTINUOUS_ACTION_SIZE, init_value=math.log(initial_std))
-        layers, parameters, distribution = _Gaussian(layers, scale), ["loc", "scale"], IndependentNormal
-    else:
-        parameters, distribution = ["logits"], Categorical
+    if not continuous:
+        return actor(in_keys, layers, Categorical)
+    scale = AddStateIndependentNormalScale(CONTINUOUS_ACTION_SIZE, init_value=math.log(initial_std))
+    return actor(in_keys, _Gaussian(layers, scale), IndependentNormal)
+
+
+def actor(in_keys: list[str], layers: nn.Module, distribution: type[Distribution]) -> ProbabilisticActor:
+    """Return a policy whose layers give the parameters of its distribution: `logits`, or `loc` and `scale`."""
+    parameters = ["logits"] if distribution is Categorical else ["loc", "scale"]
     return ProbabilisticActor(
         TensorDictModule(layers, in_keys, parameters),
         in_keys=parameters,
         distribution_class=distribution,
         # Non-finite parameters are caught where they arise (PPO.update); a check per distribution costs
         # about 40 us of a 1 ms gradient step.
-        distribution_kwargs={"validate_args": False},
+        distribution_kwargs={} if distribution is TanhNormal else {"validate_args": False},
         return_log_prob=True,
         # The library's default is the mode: a policy called outside a collector would not explore.
         default_interaction_type=InteractionType.RANDOM,
@@ -275,13 +319,13 @@ class _Gaussian(nn.Sequential):
         return parameters
 
 
-def _initialize(layers: nn.Module, head_gain: float, generator: torch.Generator | None) -> nn.Module:
+def initialize(layers: nn.Module, head_gain: float, generator: torch.Generator | None) -> nn.Module:
     """Draw orthogonal weights and zero the biases; the last layer gets its own gain."""
     if generator is None:
         return layers
     linear = [module for module in layers.modules() if isinstance(module, nn.Linear | nn.Conv2d)]
     for layer in linear:
-        gain = head_gain if layer is linear[-1] else _HIDDEN_GAIN
+        gain = head_gain if layer is linear[-1] else HIDDEN_GAIN
         nn.init.orthogonal_(layer.weight, gain, generator=generator)
         if layer.bias is not None:
             nn.init.zeros_(layer.bias)

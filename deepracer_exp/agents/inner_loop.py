@@ -18,7 +18,7 @@ from threadpoolctl import ThreadpoolController
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from deepracer_exp.config.learning import AlgorithmConfig
+from deepracer_exp.config.learning import PPOConfig
 
 from .actor_critic import ActorCritic
 
@@ -41,7 +41,7 @@ _compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc
 class InnerLoop:
     """Makes the gradient steps of an epoch, for a policy and a value network that share nothing."""
 
-    def __init__(self, networks: ActorCritic, optimizer: torch.optim.Adam, config: AlgorithmConfig) -> None:
+    def __init__(self, networks: ActorCritic, optimizer: torch.optim.Adam, config: PPOConfig) -> None:
         """Use the parameters of the networks and the moments of the optimizer, which stay theirs.
 
         Args:

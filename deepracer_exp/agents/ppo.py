@@ -1,8 +1,7 @@
-"""Algorithms: the base class, and clipped proximal policy optimisation from TorchRL's parts."""
+"""Clipped proximal policy optimisation from TorchRL's parts, and the imitation of a teacher before it."""
 
 import copy
 import math
-from dataclasses import dataclass
 from typing import Any, NoReturn
 
 import torch
@@ -13,13 +12,13 @@ from torch.distributions import Distribution, kl_divergence
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from deepracer_exp.config.learning import AlgorithmConfig, LRScheduleConfig
-from deepracer_exp.config.own_class import OwnClass, build_own
-from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.config.learning import PPOConfig
+from deepracer_exp.errors import RunFailed
 
 from .actor_critic import ActorCritic
+from .algorithm import Algorithm, UpdateMetrics, require_finite
 from .inner_loop import InnerLoop
-from .schedules import Schedule, build_schedule
+from .schedules import Schedule
 from .smoothness import Smoothness
 
 _CPU = torch.device("cpu")
@@ -35,26 +34,6 @@ _LOSS_NAMES = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class UpdateMetrics:
-    """Figures of one update, means over its gradient steps unless said otherwise. A subclass may add columns."""
-
-    policy_loss: float
-    value_loss: float
-    """Loss of the value network before it is weighted by `critic_coeff`."""
-    entropy: float
-    """Entropy of the policy in nats."""
-    kl: float
-    """KL divergence of the collecting policy from the updated one, estimated over the last epoch."""
-    clip_fraction: float
-    """Share of steps whose probability ratio was clipped."""
-    explained_variance: float
-    """Share of the variance of the value targets that the values before the update explain; 1 is perfect."""
-    grad_norm: float
-    """Norm of the gradient before clipping."""
-    lr: float
-
-
 class _Loss(ClipPPOLoss):
     """ClipPPOLoss for distributions with an entropy in closed form.
 
@@ -66,47 +45,6 @@ class _Loss(ClipPPOLoss):
         return dist.entropy().unsqueeze(-1)
 
 
-class Algorithm:
-    """Improves an actor-critic from batches of its own driving; base class of your own algorithms."""
-
-    def __init__(
-        self, actor_critic: ActorCritic, config: AlgorithmConfig, schedule: Schedule, seed: int
-    ) -> None:
-        """Store the parts.
-
-        Args:
-            actor_critic: Updated in place.
-            config: The group `algorithm`.
-            schedule: Of the learning rate.
-            seed: Of the algorithm's own random streams.
-        """
-        self.networks, self.config, self.schedule = actor_critic, config, schedule
-
-    def update(self, batch: TensorDictBase, iteration: int, fraction: float) -> UpdateMetrics:
-        """Learn from one batch.
-
-        Args:
-            batch: Leading dimensions [..., T], time last and contiguous. Holds `observation` (`pixels`, `lidar`),
-                `action`, `action_log_prob` and `next` with `observation` (of a finished episode: its last one, not
-                the first of the new one), `reward`, `done`, `terminated`, each of the latter [..., T, 1].
-            iteration: Updates made before this one.
-            fraction: Share of the budget spent, 0 to 1.
-
-        Raises:
-            RunFailed: Input, loss or gradient is not finite; the networks are as before that gradient step.
-        """
-        raise NotImplementedError
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return what a checkpoint holds: tensors and plain values; `networks` is what evaluations read."""
-        return {"networks": self.networks.state_dict(), "schedule": self.schedule.state_dict()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a `state_dict`."""
-        self.networks.load_state_dict(state["networks"])
-        self.schedule.load_state_dict(state["schedule"])
-
-
 class PPO(Algorithm):
     """Clipped PPO.
 
@@ -116,10 +54,13 @@ class PPO(Algorithm):
     its last observation.
     """
 
+    networks: ActorCritic
+    config: PPOConfig
+
     def __init__(
         self,
         actor_critic: ActorCritic,
-        config: AlgorithmConfig,
+        config: PPOConfig,
         schedule: Schedule,
         seed: int,
         device: torch.device = _CPU,
@@ -264,7 +205,7 @@ class PPO(Algorithm):
     @torch.no_grad()
     def _prepare(self, batch: TensorDictBase) -> tuple[TensorDictBase, float]:
         """Return the steps in one row with `advantage` and `value_target`, and the explained variance."""
-        _require_finite(batch)
+        require_finite(batch)
         value = self._value_of(batch)
         # An unfinished step's next observation is the next row's observation, whose value is known: only ends
         # of episodes and of the batch are evaluated. 4 ms for 8192 steps, against 14 ms of two full passes.
@@ -365,7 +306,7 @@ class Distillation(PPO):
     def __init__(
         self,
         actor_critic: ActorCritic,
-        config: AlgorithmConfig,
+        config: PPOConfig,
         schedule: Schedule,
         seed: int,
         teacher: TensorDictModuleBase,
@@ -426,55 +367,3 @@ class Distillation(PPO):
                 sharpened = {"loc": teacher["loc"], "scale": teacher["scale"] * math.sqrt(_TEMPERATURE)}
             steps["teacher"] = TensorDict(sharpened, steps.batch_size)
         return steps, explained_variance
-
-
-def _require_finite(batch: TensorDictBase) -> None:
-    keys = ("observation", "action", "action_log_prob", ("next", "observation"), ("next", "reward"))
-    for key in keys:
-        finite = torch.isfinite(batch[key])
-        if not finite.all():
-            name = " ".join(key) if isinstance(key, tuple) else key
-            position = (~finite).nonzero()[0].tolist()
-            raise RunFailed(f"{name} is {batch[key][tuple(position)].item()} at {position} of the batch")
-
-
-def build_agent(
-    actor_critic: ActorCritic,
-    config: AlgorithmConfig,
-    lr_schedule: LRScheduleConfig,
-    seed: int,
-    teacher: TensorDictModuleBase | None = None,
-    device: torch.device = _CPU,
-    commands: Tensor | None = None,
-) -> Algorithm:
-    """Return the algorithm of the group `algorithm`, with its learning-rate schedule.
-
-    Args:
-        actor_critic: Updated by it in place.
-        config: The group `algorithm`.
-        lr_schedule: The group `lr_schedule`.
-        seed: Of the algorithm's own random streams.
-        teacher: A policy with the same actions that is imitated for the first `config.teacher_iterations`.
-        device: Where updates are computed; a class of the user's own chooses it itself.
-        commands: What the actions of a discrete policy mean, see `Smoothness`.
-
-    Raises:
-        BadInput: a class of the user's own cannot be used, or has no loss that could be smooth.
-    """
-    schedule = build_schedule(lr_schedule)
-    agent: Algorithm
-    if teacher is not None:
-        agent = Distillation(actor_critic, config, schedule, seed, teacher, device)
-    elif config.target is None:
-        agent = PPO(actor_critic, config, schedule, seed, device)
-    else:
-        described = OwnClass(target=config.target, kwargs=config.kwargs)
-        # Its constructor may draw weights; the global random state has no part in them.
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            agent = build_own(described, "algorithm.target", Algorithm, actor_critic, config, schedule, seed)
-    if config.smoothness:
-        if not isinstance(agent, PPO):
-            raise BadInput(f"algorithm.smoothness={config.smoothness:g}", f"{config.target} is no PPO", "0")
-        agent.smooth(commands)
-    return agent

@@ -18,7 +18,8 @@ from deepracer_exp.aws.archives import natural
 from deepracer_exp.aws.models.model_metadata import CAMERAS, LIDARS
 from deepracer_exp.errors import BadInput
 
-from .actor_critic import ActorCritic, SensorNet
+from .actor_critic import CONTINUOUS_ACTION_SIZE, ActorCritic, PolicyNetworks, SensorNet
+from .soft_actor_critic import BoundedGaussian
 
 Array = npt.NDArray[np.float32]
 
@@ -75,14 +76,15 @@ class _Layer(NamedTuple):
             self.module.bias.copy_(torch.from_numpy(bias.copy()))  # type: ignore[union-attr]
 
 
-def to_service(networks: ActorCritic, sensors: Sequence[str]) -> dict[str, Array]:
+def to_service(networks: PolicyNetworks, sensors: Sequence[str]) -> dict[str, Array]:
     """Return the parameters as the service's tensors, by name.
 
     Kernels of convolutions are [height, width, in, out] and those of dense layers [in, out]; pictures are flattened
     row by row with all channels of a pixel together; the readings of sensors follow each other in the order of their
     names. Convolutions of 1x1 at the end of a picture's layers are the service's dense layers of an embedder, which it
     applies to each pixel. A trunk that both share is written twice. Where the value network does not see what the
-    policy does, there are the policy's tensors alone.
+    policy does, there are the policy's tensors alone, as of soft actor-critic, whose mean has the name of PPO's and
+    comes before the hyperbolic tangent.
 
     Args:
         networks: of `SensorNet`s.
@@ -95,6 +97,10 @@ def to_service(networks: ActorCritic, sensors: Sequence[str]) -> dict[str, Array
     tensors = {}
     for layer in layers:
         tensors[f"{layer.name}/kernel"], tensors[f"{layer.name}/bias"] = layer.to_service()
+    if isinstance(networks.policy_head[0].module, BoundedGaussian):
+        for part in ("kernel", "bias"):
+            both = tensors[f"{POLICY_HEAD}/policy_mean/{part}"]
+            tensors[f"{POLICY_HEAD}/policy_mean/{part}"] = both[..., :CONTINUOUS_ACTION_SIZE].copy()
     for scope in sorted({_scope(name) for name in tensors}):
         tensors[f"{scope}/{_RESCALER}"] = np.ones((), np.float32)
     if scale is not None:
@@ -198,15 +204,18 @@ def _scope(name: str) -> str:
 
 
 def _layers(
-    networks: ActorCritic, sensors: Sequence[str]
+    networks: PolicyNetworks, sensors: Sequence[str]
 ) -> tuple[list[_Layer], AddStateIndependentNormalScale | None]:
     """Return the layers in the order of the service, the value network's first, and the standard deviation."""
-    policy, value = networks.policy_head[0].module, networks.value_head.module
-    scale = None
+    policy = networks.policy_head[0].module
+    value = networks.value_head.module if isinstance(networks, ActorCritic) else None
+    scale, bounded = None, isinstance(policy, BoundedGaussian)
+    if bounded:
+        policy = policy.layers
     if isinstance(policy, nn.Sequential) and isinstance(policy[-1], AddStateIndependentNormalScale):
         policy, scale = policy
     trunk = None if networks.trunk is None else networks.trunk.module
-    policy_head = f"{POLICY_HEAD}/{'policy_fc' if scale is None else 'policy_mean'}"
+    policy_head = f"{POLICY_HEAD}/{'policy_fc' if scale is None and not bounded else 'policy_mean'}"
     layers: list[_Layer] = []
     if isinstance(value, SensorNet) or (trunk is not None and isinstance(value, nn.Sequential)):
         layers += _trunk(trunk or value, VALUE, sensors)

@@ -5,6 +5,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.distributions import Categorical, Distribution, Independent
+from torchrl.modules import TanhNormal
 
 NOISE = "noise"
 """Standard normal numbers of each car for its next action, float64: one for an index, two for steering and speed."""
@@ -28,19 +29,27 @@ class SamplingPolicy(TensorDictModuleBase):
         # Apart, since a trunk's output is left there, too.
         acted = tensordict.select(*self.policy.in_keys)
         distribution = self.policy.get_dist(acted)
-        action = _drawn(distribution, tensordict.get(NOISE))
+        action, log_prob = _drawn(distribution, tensordict.get(NOISE))
         acted.set("action", action)
-        acted.set("action_log_prob", distribution.log_prob(action))
+        acted.set("action_log_prob", log_prob)
         for key in self.out_keys:
             tensordict.set(key, acted.get(key))
         return tensordict
 
 
-def _drawn(distribution: Distribution, noise: Tensor) -> Tensor:
-    """Return samples for standard normal numbers, by the inverse of the distribution function."""
+def _drawn(distribution: Distribution, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """Return samples for standard normal numbers and their log-density, by the inverse of the distribution function."""
     if isinstance(distribution, Categorical):
         below = distribution.probs.cumsum(-1)[..., :-1]  # the last is 1, up to rounding
-        return (torch.special.ndtr(noise) >= below).sum(-1)
+        action = (torch.special.ndtr(noise) >= below).sum(-1)
+        return action, distribution.log_prob(action)
+    if isinstance(distribution, TanhNormal):
+        # Scored before the tangent, which cannot be inverted near -1 and 1.
+        before, log_prob = _drawn(distribution.base_dist, noise)
+        (tangent,) = distribution.transforms
+        action = tangent(before)
+        return action, log_prob - tangent.log_abs_det_jacobian(before, action).sum(-1)
     assert isinstance(distribution, Independent)
     normal = distribution.base_dist
-    return normal.loc + normal.scale * noise.to(normal.loc.dtype)
+    action = normal.loc + normal.scale * noise.to(normal.loc.dtype)
+    return action, distribution.log_prob(action)

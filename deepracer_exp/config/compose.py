@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import yaml
 from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.types import ChoiceSweep, Glob, Override, RangeSweep
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from deepracer_exp.addresses import without_passwords
@@ -24,6 +24,7 @@ from .custom_files import FileOverrides, file_overrides, read_custom_files
 from .dimension import range_length
 from .evaluation import EvaluateConfig, EvaluationConfig
 from .experiment import Experiment
+from .learning import of_ppo_alone
 from .option_files import change, composed, composed_option, first_line, plain
 from .options import groups, listed, options
 from .overrides import PLAIN_TEXT, override_line, parse_single, parse_sweep
@@ -122,6 +123,7 @@ def compose_entry(entry: str, overrides: Sequence[str], *, stored: bool = False)
         if names:
             config[TRACK] = {name: composed_option(TRACK, name) for name in names}
             choices[TRACK] = f"[{','.join(names)}]"
+        unfit = _leave_out_of_other_algorithm(config, choices)
         try:
             for override in changing:
                 if _is_taken_for_a_group(config, override) or not change(config, override):
@@ -145,7 +147,22 @@ def compose_entry(entry: str, overrides: Sequence[str], *, stored: bool = False)
         choices={group: option for group, option in choices.items() if group in groups(entry)},
         mapping=mapping,
         names=files.names,
-        notes=(*files.notes, *left_out),
+        notes=(*files.notes, *unfit, *left_out),
+    )
+
+
+def _leave_out_of_other_algorithm(config: DictConfig, choices: Mapping[str, str]) -> list[str]:
+    """Leave out what a chosen experiment sets for PPO where SAC is chosen beside it; return a line that names it."""
+    experiment, algorithm = choices.get("experiment"), config.get("algorithm")
+    if experiment is None or algorithm is None or "replay_steps" not in algorithm:
+        return []
+    unfit = [key for key in of_ppo_alone() if key in algorithm]
+    with open_dict(algorithm):
+        for key in unfit:
+            del algorithm[key]
+    what = ", ".join(f"algorithm.{key}" for key in unfit)
+    return (
+        [f"experiment={experiment}: {what}: not used with algorithm={choices['algorithm']}"] if unfit else []
     )
 
 

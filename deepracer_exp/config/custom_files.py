@@ -52,7 +52,20 @@ TAKEN = {
     "num_episodes_between_training": "algorithm.episodes_per_iteration",
     "term_cond_max_episodes": "budget.iterations",
 }
-"""Keys of hyperparameters.json and our keys for the same values."""
+"""Keys of hyperparameters.json and our keys for the same values, of PPO."""
+
+SAC_TAKEN = {
+    "lr": "algorithm.lr",
+    "batch_size": "algorithm.batch_size",
+    "discount_factor": "algorithm.discount",
+    "loss_type": "algorithm.loss_type",
+    "sac_alpha": "algorithm.alpha",
+    "term_cond_max_episodes": "budget.iterations",
+}
+"""Keys of a hyperparameters.json of SAC, and our keys for the same values."""
+
+SAC_OPTION = "sac_service"
+"""The algorithm that a file of SAC stands for."""
 
 FRAMES = "algorithm.frames_per_iteration"
 """Our alternative length of an iteration; null where the file's number of episodes is used."""
@@ -63,12 +76,15 @@ NOT_APPLICABLE = {
     "stack_size": "the service ignores it, too",
     "term_cond_avg_score": "the service only stores it",
     "sac_alpha": "for SAC only",
+    "num_epochs": "for PPO only",
+    "beta_entropy": "for PPO only; SAC's is sac_alpha",
+    "num_episodes_between_training": "the service's SAC learns after every episode, too",
     "sensor": "here observation=NAME chooses what the policy sees; the same sensors:",
     "neural_network": "for camera images; here use network=NAME",
     "version": f"no car of that simulation version; the oldest is car={CARS[4]}",
     "lidar_config": "here values of observation.lidar",
 }
-"""Keys of both JSON files that have no effect here, and why."""
+"""Keys of both JSON files that have no effect here, at least with one of the algorithms, and why."""
 
 
 class Left(NamedTuple):
@@ -127,6 +143,18 @@ class CustomFiles:
         return CARS.get(self.metadata.version)
 
     @property
+    def is_sac(self) -> bool:
+        """Return whether they are of a training with SAC: by the metadata, without it by the exploration of SAC."""
+        if self.metadata is not None:
+            return self.metadata.training_algorithm == "sac"
+        return self.hyperparameters is not None and self.hyperparameters.exploration_type == "additive_noise"
+
+    @property
+    def taken(self) -> Mapping[str, str]:
+        """Return the keys of hyperparameters.json that are used, and ours for the same values."""
+        return SAC_TAKEN if self.is_sac else TAKEN
+
+    @property
     def learning(self) -> dict[str, Any]:
         """Return the values that are used, by key of hyperparameters.json; empty without the file."""
         settings = self.hyperparameters
@@ -135,7 +163,7 @@ class CustomFiles:
         # The service's default is no limit in practice, so that ours is kept.
         return {
             key: getattr(settings, key)
-            for key in TAKEN
+            for key in self.taken
             if key != "term_cond_max_episodes" or key in settings.given
         }
 
@@ -169,13 +197,13 @@ class CustomFiles:
             yield ", ".join(missing), "missing in the file; the service's default is used"
         for key in settings.beyond_console():
             yield f"{key}={getattr(settings, key)}", "used, although the AWS console would not accept it"
-        if settings.exploration_type != "categorical":
+        if settings.exploration_type != ("additive_noise" if self.is_sac else "categorical"):
             yield (
                 f"exploration_type={settings.exploration_type}",
-                "not applicable: here actions are drawn from the policy (categorical)",
+                "not applicable: here actions are drawn from the policy (categorical, of SAC additive_noise)",
             )
         for key in settings.given:
-            if key in NOT_APPLICABLE:
+            if key in NOT_APPLICABLE and key not in self.taken:
                 yield f"{key}={getattr(settings, key)}", f"not applicable: {NOT_APPLICABLE[key]}"
         yield from _unknown(settings.given, hyperparameters.KEYS)
 
@@ -260,7 +288,7 @@ def read_custom_files(folder: str) -> CustomFiles:
         raise BadInput(f"{KEY} {folder}", f"holds {', '.join(held) or 'nothing'}", f"{accepted}{inside}")
     metadata = paths.get("model_metadata.json")
     learning = paths.get("hyperparameters.json")
-    files = CustomFiles(
+    return CustomFiles(
         folder,
         paths,
         read_model_metadata(metadata) if metadata else None,
@@ -269,12 +297,6 @@ def read_custom_files(folder: str) -> CustomFiles:
         left,
         tuple(unused),
     )
-    if files.metadata is not None and files.metadata.training_algorithm != "clipped_ppo":
-        raise BadInput(
-            f"{metadata}: training_algorithm: {files.metadata.training_algorithm}; accepted: clipped_ppo, the only "
-            "algorithm so far"
-        )
-    return files
 
 
 def _workers(folder: str, names: Sequence[str]) -> tuple[tuple[JobSettings, ...], list[str]]:
@@ -354,8 +376,15 @@ def file_overrides(files: CustomFiles, typed: Mapping[str, str]) -> FileOverride
     notes += applied
 
     taken = []
+    if files.is_sac:
+        winner = first_given(typed, "algorithm")
+        if winner is None:
+            lines.append(override_line("algorithm", SAC_OPTION))
+            taken.append(f"algorithm={SAC_OPTION}")
+        else:
+            notes.append(f"training_algorithm=sac: not used, because of {winner}")
     for key, value in files.learning.items():
-        target = TAKEN[key]
+        target = files.taken[key]
         group = target.partition(".")[0]
         winner = first_given(typed, group, target)
         if key == "num_episodes_between_training":
@@ -370,7 +399,10 @@ def file_overrides(files: CustomFiles, typed: Mapping[str, str]) -> FileOverride
         else:
             notes.append(f"hyperparameters.json: {key}={value}: not used, because of {winner}")
     if taken:
-        notes.append(f"hyperparameters.json: used as {', '.join(taken)}")
+        source = (
+            "hyperparameters.json" if files.hyperparameters else "model_metadata.json: training_algorithm=sac"
+        )
+        notes.append(f"{source}: used as {', '.join(taken)}")
     job, applied = job_overrides(files.workers, typed)
     notes += [*applied, *_left(files, typed)]
     return FileOverrides(tuple([*lines, *job]), names, (*notes, *files.remarks()))

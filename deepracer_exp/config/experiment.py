@@ -9,7 +9,16 @@ from pydantic import AfterValidator, Field
 from .car import CarConfig
 from .driving import ActionSpaceConfig, EpisodeConfig, ObservationConfig, RandomizationConfig, RewardConfig
 from .evaluation import EvaluationConfig
-from .learning import AlgorithmConfig, CNNConfig, LRScheduleConfig, MLPConfig, NetworkConfig
+from .learning import (
+    AdaptiveKLLR,
+    CNNConfig,
+    LRScheduleConfig,
+    MLPConfig,
+    NetworkConfig,
+    OneAlgorithm,
+    PPOConfig,
+    SACConfig,
+)
 from .race import ALONE, RaceConfig
 from .running import BudgetConfig, CheckpointsConfig, CollectorConfig, TrackingConfig
 from .stopping import StoppingConfig
@@ -55,7 +64,7 @@ class Experiment:
     episode: EpisodeConfig
     reward: RewardConfig
     network: NetworkConfig
-    algorithm: AlgorithmConfig
+    algorithm: OneAlgorithm
     lr_schedule: LRScheduleConfig
     collector: CollectorConfig
     evaluation: EvaluationConfig
@@ -69,13 +78,17 @@ class Experiment:
 
     def __post_init__(self) -> None:
         """Refuse groups that contradict each other, such as a network that cannot read what is observed."""
-        if self.teacher is None and self.algorithm.teacher_iterations:
+        algorithm = self.algorithm
+        if isinstance(algorithm, SACConfig):
+            self._check_sac()
+        imitates = isinstance(algorithm, PPOConfig) and algorithm.teacher_iterations > 0
+        if self.teacher is None and imitates:
             raise ValueError("teacher: algorithm=distill needs one; accepted: teacher=RUN, a trained run")
-        if self.device != "cpu" and self.algorithm.target is not None:
+        if self.device != "cpu" and isinstance(algorithm, PPOConfig) and algorithm.target is not None:
             raise ValueError(
                 f"device={self.device}: an algorithm of your own chooses where it computes; accepted: device=cpu"
             )
-        if self.teacher is not None and not self.algorithm.teacher_iterations:
+        if self.teacher is not None and not imitates:
             raise ValueError("teacher: only algorithm=distill learns from one; accepted: algorithm=distill")
         camera, lidar, network = self.observation.camera, self.observation.lidar, self.network
         if self.race.others and not self.observation.next_objects and camera is None and lidar is None:
@@ -111,6 +124,18 @@ class Experiment:
             raise ValueError(
                 f"network.lidar_joins_after={network.lidar_joins_after}: of {len(network.hidden)} hidden layers at "
                 f"least one comes after; accepted: 0 to {len(network.hidden) - 1}"
+            )
+
+    def _check_sac(self) -> None:
+        """Refuse what soft actor-critic cannot do."""
+        if isinstance(self.lr_schedule, AdaptiveKLLR):
+            raise ValueError(
+                "lr_schedule=adaptive_kl: follows PPO's change of the policy, which SAC does not measure; accepted: "
+                "lr_schedule=constant, linear, cosine, exponential, step, warmup"
+            )
+        if getattr(self.network, "shared_trunk", False):
+            raise ValueError(
+                "network.shared_trunk=true: SAC's policy and critics share no layers; accepted: false"
             )
 
     @property

@@ -1,6 +1,6 @@
 """Network, algorithm and learning-rate schedule."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, Tag
@@ -75,21 +75,27 @@ NetworkConfig = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class AlgorithmConfig:
-    """Clipped PPO, its hyperparameters by the meaning DeepRacer gives them; or an algorithm of your own with them."""
+    """What every algorithm has: the hyperparameters of a gradient step, and the length of an iteration."""
 
     lr: Positive
     batch_size: Annotated[int, Field(ge=1, le=10**6)]
-    epochs: UpTo1000
     discount: Fraction
+    loss_type: Literal["huber", "mean squared error"]
+    max_grad_norm: NonNegative
+    frames_per_iteration: Steps | None
+    episodes_per_iteration: Annotated[int, Field(ge=1, le=10**5)] | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class PPOConfig(AlgorithmConfig):
+    """Clipped PPO, its hyperparameters by the meaning DeepRacer gives them; or an algorithm of your own with them."""
+
+    epochs: UpTo1000
     gae_lambda: Fraction
     clip_epsilon: Positive
     entropy_coeff: NonNegative
     entropy_end_factor: NonNegative = 1.0
     critic_coeff: Positive
-    loss_type: Literal["huber", "mean squared error"]
-    max_grad_norm: NonNegative
-    frames_per_iteration: Steps | None
-    episodes_per_iteration: Annotated[int, Field(ge=1, le=10**5)] | None
     smoothness: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.0
     teacher_iterations: Annotated[int, Field(ge=0, le=10**6)] = 0
     teacher_batch_size: Annotated[int, Field(ge=1, le=10**6)] = 128
@@ -102,6 +108,42 @@ class AlgorithmConfig:
             raise ValueError("kwargs are arguments of a class of your own; give target=package.module:Class")
         if self.teacher_iterations and self.target is not None:
             raise ValueError("teacher_iterations: only PPO learns from a teacher; give target or a teacher")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SACConfig(AlgorithmConfig):
+    """Soft actor-critic with a replay of past steps."""
+
+    steps_per_gradient_step: Annotated[float, Field(ge=0.01, le=10**6, allow_inf_nan=False)]
+    warmup_steps: Annotated[int, Field(ge=0, le=10**7)]
+    replay_steps: Annotated[int, Field(ge=1, le=10**8)]
+    replay_mb: Annotated[int, Field(ge=1, le=10**6)]
+    alpha: Positive
+    learn_alpha: bool
+    target_entropy: Annotated[float, Field(ge=-100, le=1.4, allow_inf_nan=False)]
+    target_entropy_share: Fraction
+    tau: Annotated[float, Field(gt=0, le=1)] | None
+    value_network: bool
+
+    def __post_init__(self) -> None:
+        """Refuse a minibatch that two critics cannot divide."""
+        if self.value_network and self.batch_size % 2:
+            raise ValueError(
+                f"batch_size={self.batch_size}: with value_network=true each critic learns from a half; accepted: even"
+            )
+
+
+def of_ppo_alone() -> list[str]:
+    """Return the keys that PPO has and SAC does not."""
+    ours = {key.name for key in fields(SACConfig)}
+    return [key.name for key in fields(PPOConfig) if key.name not in ours]
+
+
+OneAlgorithm = Annotated[
+    Annotated[PPOConfig, Tag("ppo")] | Annotated[SACConfig, Tag("sac")],
+    Discriminator(lambda value: "sac" if isinstance(value, dict) and "replay_steps" in value else "ppo"),
+]
+"""One of the algorithms; their keys tell them apart."""
 
 
 @dataclass(frozen=True, kw_only=True)

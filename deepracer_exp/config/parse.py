@@ -11,6 +11,7 @@ from deepracer_exp.aws.worlds.catalogue import worlds
 from deepracer_exp.errors import BadInput, Unknown, nearest
 
 from .experiment import Experiment
+from .learning import PPOConfig
 from .own_class import GROUPS, load_class, own_classes
 from .track import TrackConfig
 
@@ -63,7 +64,7 @@ def _check_combinations(experiment: Experiment) -> None:
             f"algorithm.episodes_per_iteration={algorithm.episodes_per_iteration}: set exactly one, the other null"
         )
     frames = algorithm.frames_per_iteration
-    if frames is not None and algorithm.batch_size > frames:
+    if frames is not None and algorithm.batch_size > frames and isinstance(algorithm, PPOConfig):
         raise BadInput(
             f"algorithm.batch_size={algorithm.batch_size} is larger than algorithm.frames_per_iteration={frames}",
             "a minibatch cannot hold more steps than an iteration",

@@ -12,10 +12,12 @@ from deepracer_exp.aws.models.model_metadata import (
     beyond_console,
     model_metadata_text,
 )
-from deepracer_exp.config.custom_files import CARS, TAKEN
+from deepracer_exp.config.custom_files import CARS, SAC_TAKEN, TAKEN
 from deepracer_exp.config.driving import ObservationConfig
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.learning import SACConfig
 from deepracer_exp.env.action_space import build_action_space, metadata_of
+from deepracer_exp.errors import BadInput, count
 from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.validation.aws_rules import text_findings
 
@@ -40,6 +42,12 @@ def aws_files(experiment: Experiment, reward: str) -> tuple[dict[str, str], list
     `reward` is the text of the reward function, with its constants filled in.
     """
     metadata = services_metadata(experiment)
+    if isinstance(experiment.algorithm, SACConfig) and metadata.training_algorithm != "sac":
+        raise BadInput(
+            "algorithm",
+            f"SAC with a list of {count(len(metadata.actions), 'action')}, which the service's SAC cannot have",
+            "a run with action_space=continuous or algorithm=ppo, or format=onnx or car",
+        )
     learning, changed = _hyperparameters(experiment)
     texts = {
         "reward_function.py": reward,
@@ -53,7 +61,10 @@ def services_metadata(experiment: Experiment) -> ModelMetadata:
     """Return the action space, the sensors and the car's simulation version of an experiment in the service's terms."""
     actions = metadata_of(build_action_space(experiment.action_space))
     version = next((number for number, car in CARS.items() if car == experiment.car.name), actions.version)
-    return replace(actions, version=version, **sensor_keys(experiment.observation))
+    # The service's SAC has no lists of actions.
+    algorithm = "sac" if isinstance(experiment.algorithm, SACConfig) and actions.low else "clipped_ppo"
+    sensors = sensor_keys(experiment.observation)
+    return replace(actions, version=version, training_algorithm=algorithm, **sensors)
 
 
 def sensor_keys(observation: ObservationConfig) -> dict[str, Any]:
@@ -71,8 +82,9 @@ def sensor_keys(observation: ObservationConfig) -> dict[str, Any]:
 
 def hyperparameters_of(experiment: Experiment) -> Hyperparameters:
     """Return an experiment's hyperparameters in the service's terms, with the service's default where it has none."""
-    own = {}
-    for key, target in TAKEN.items():
+    is_sac = isinstance(experiment.algorithm, SACConfig)
+    own: dict[str, Any] = {"exploration_type": "additive_noise"} if is_sac else {}
+    for key, target in (SAC_TAKEN if is_sac else TAKEN).items():
         group, name = target.split(".")
         own[key] = getattr(getattr(experiment, group), name)
     return replace(Hyperparameters(), **{key: value for key, value in own.items() if value is not None})
@@ -81,7 +93,13 @@ def hyperparameters_of(experiment: Experiment) -> Hyperparameters:
 def _hyperparameters(experiment: Experiment) -> tuple[Hyperparameters, list[str]]:
     notes = []
     learning = hyperparameters_of(experiment)
-    if experiment.algorithm.episodes_per_iteration is None:
+    is_sac = isinstance(experiment.algorithm, SACConfig)
+    if is_sac:
+        notes.append(
+            "hyperparameters.json: the service's SAC learns after each episode, with sac_alpha fixed and one gradient "
+            "step for each step; its replay, targets and temperature cannot be set"
+        )
+    elif experiment.algorithm.episodes_per_iteration is None:
         notes.append(
             f"hyperparameters.json: num_episodes_between_training={learning.num_episodes_between_training}, the "
             f"service's default; this run used {experiment.algorithm.frames_per_iteration} control steps per iteration"

@@ -58,6 +58,12 @@ def aws_model(
     """
     texts, notes = aws_files(experiment, reward)
     metadata = services_metadata(experiment)
+    if not isinstance(stored.networks, ActorCritic):
+        raise BadInput(
+            "algorithm",
+            "is SAC, whose critics the service has in degrees and metres per second",
+            "a run with algorithm=ppo, or format=car, onnx or aws",
+        )
     _refuse_other_sensors(experiment, metadata)
     networks, note = _with_value(experiment, stored.networks)
     tensors = to_service(networks, metadata.sensor)

@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from deepracer_exp.agents.actor_critic import ActorCritic
+from deepracer_exp.agents.actor_critic import PolicyNetworks
 from deepracer_exp.agents.service_weights import to_service
+from deepracer_exp.agents.soft_actor_critic import BoundedGaussian
 from deepracer_exp.aws.models.car_archive import (
     ENDING,
     GRAPH,
@@ -77,7 +78,7 @@ def name_in_exports(run: StoredRun) -> str:
     return name_on_car(run.path.name) + ENDING
 
 
-def car_archive(networks: ActorCritic, experiment: Experiment) -> CarArchive:
+def car_archive(networks: PolicyNetworks, experiment: Experiment) -> CarArchive:
     """Return the archive of a policy; the same policy gives the same bytes.
 
     Raises:
@@ -91,11 +92,16 @@ def car_archive(networks: ActorCritic, experiment: Experiment) -> CarArchive:
     metadata = replace(metadata, **sensor_keys(observation))
     notes = sensor_notes(metadata.sensor)
     tensors: Tensors = to_service(networks, metadata.sensor)
-    bounds = None
-    if rescaling is not None:
+    bounds = tangent = None
+    if isinstance(networks.policy_head[0].module, BoundedGaussian):
+        # The car takes the output of PPO's head for the mean, so the tangent of ours is part of the graph.
+        factor, shift = rescaling or Rescaling(np.ones(2), np.zeros(2))
+        tangent = factor.astype(np.float32), shift.astype(np.float32)
+    elif rescaling is not None:
         factor, shift = rescaling
         tensors = _rescaled(tensors, rescaling)
         bounds = (shift - factor).astype(np.float32), (shift + factor).astype(np.float32)
+    if rescaling is not None:
         lock_deg = full_scale(metadata).steering_deg
         notes.append(
             f"steering from {actions.low[0]:g} to {actions.high[0]:g} degrees is written as -{lock_deg:g} to "
@@ -109,7 +115,7 @@ def car_archive(networks: ActorCritic, experiment: Experiment) -> CarArchive:
     if observation.lidar is not None:
         shapes.append((observation.lidar.size,))
     inputs = dict(zip(metadata.sensor, shapes, strict=True))
-    graph = policy_graph(tensors, inputs, network.strides, bounds)
+    graph = policy_graph(tensors, inputs, network.strides, bounds, tangent)
     check_weights(graph, tensors)
     values = json.loads(model_metadata_text(metadata))
     try:

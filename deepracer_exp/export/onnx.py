@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from deepracer_exp.agents.actor_critic import ActorCritic, SensorNet
+from deepracer_exp.agents.actor_critic import PolicyNetworks, SensorNet
+from deepracer_exp.agents.soft_actor_critic import SoftActorCritic
 from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.env.action_space import ActionSpace, DiscreteActions, build_action_space
 from deepracer_exp.env.observation import feature_names, observation_shape
@@ -69,11 +70,11 @@ class DeployedPolicy(nn.Module):
 
     In: `observation` (N, features); or `pixels` (N, channels, height, width), bytes, and/or `lidar` (N, readings).
     Out: `policy`, the probabilities of the actions (N, n), or for a continuous policy the mean of [steering, speed]
-    clipped to -1..1 (N, 2); and `command` (N, 2), degrees (positive to the left) and metres per second, of the
-    likeliest action or of that mean.
+    within -1..1 (N, 2), clipped or, of soft actor-critic, by its hyperbolic tangent; and `command` (N, 2), degrees
+    (positive to the left) and metres per second, of the likeliest action or of that mean.
     """
 
-    def __init__(self, networks: ActorCritic, actions: ActionSpace):
+    def __init__(self, networks: PolicyNetworks, actions: ActionSpace):
         """Share the layers of `networks`, which must not be trained further."""
         super().__init__()
         trunk = networks.trunk
@@ -84,6 +85,7 @@ class DeployedPolicy(nn.Module):
             if isinstance(module, SensorNet):
                 module.half_precision = False  # a file for any processor
         self.discrete = isinstance(actions, DiscreteActions)
+        self.bounded = isinstance(networks, SoftActorCritic)
         if isinstance(actions, DiscreteActions):
             rows = [actions.steering_deg, actions.speed_mps]
         else:
@@ -98,7 +100,7 @@ class DeployedPolicy(nn.Module):
         if self.discrete:
             policy = torch.softmax(outputs, dim=-1)
             return policy, self.table[policy.argmax(dim=-1)]
-        policy = outputs[0].clamp(-1.0, 1.0)
+        policy = outputs[0].tanh() if self.bounded else outputs[0].clamp(-1.0, 1.0)
         share = (policy + 1.0) * 0.5
         return policy, self.table[0] * (1.0 - share) + self.table[1] * share
 

@@ -2,51 +2,39 @@
 
 import contextlib
 import logging
-import re
 import shutil
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from torchrl.checkpoint import Checkpoint, CheckpointError, StateDictCheckpointAdapter
+from torchrl.checkpoint import Checkpoint, StateDictCheckpointAdapter
 
-from deepracer_exp.agents.actor_critic import ActorCritic, build_actor_critic
-from deepracer_exp.agents.ppo import Algorithm
+from deepracer_exp.agents.actor_critic import PolicyNetworks
+from deepracer_exp.agents.algorithm import Algorithm
+from deepracer_exp.agents.build import build_networks
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.errors import BadInput, RunFailed
 
-from .checkpoint_files import (
-    HASHES,
-    MANIFEST,
-    find_checkpoint,
-    kept_checkpoints,
-    pinned,
-    restore_links,
-    verify,
-    write_hashes,
-)
+from .checkpoint_files import find_checkpoint, kept_checkpoints, pinned, restore_links, write_hashes
+from .components import State, check_folder, load_component, one_line
 from .files import CHECKPOINTS
+from .replay_parts import ReplayParts
 
 logger = logging.getLogger("deepracer_exp")
 
 AGENT, TRAINING = "agent", "training"
 """Components: the networks with what improves them, and what a resumed training needs besides."""
-_STATE = {"state.json", "state.tdz"}
-_MOST_BYTES = 2**32
-"""Limit for a checkpoint; the largest known have tens of megabytes."""
-_MEMBER = re.compile(r"meta\.json|tensor_\d+\.memmap")
 
 
 @dataclass(frozen=True, eq=False)
 class StoredPolicy:
     """The networks of a checkpoint."""
 
-    networks: ActorCritic
+    networks: PolicyNetworks
     path: Path
     """The checkpoint's folder itself, not a link to it."""
     counters: dict[str, Any]
@@ -99,42 +87,7 @@ def check(path: Path, *, resumable: bool = False) -> Path:
     Raises:
         BadInput: any other.
     """
-    if not path.is_dir():
-        kind = "a broken link" if path.is_symlink() else "no folder"
-        raise BadInput(path, f"is {kind}; a pickle is never loaded")
-    path = path.resolve()
-    entries = list(path.rglob("*"))
-    links = [entry for entry in entries if entry.is_symlink()]
-    if links:
-        raise BadInput(links[0], "is a link; the files of a checkpoint must be in its own folder")
-    files = {file.name for file in entries if not file.is_dir()}
-    foreign = sorted(files - _STATE - {MANIFEST, HASHES})
-    if foreign:
-        raise BadInput(
-            path,
-            f"contains {foreign[0]}",
-            "the tensors and JSON files of a checkpoint; a pickle is never loaded",
-        )
-    if (total := sum(entry.stat().st_size for entry in entries)) > _MOST_BYTES:
-        raise BadInput(path, f"has {total:,} bytes", f"up to {_MOST_BYTES // 2**30} GiB")
-    for name in (MANIFEST, HASHES):
-        if name not in files:
-            raise BadInput(path, f"has no {name}: incomplete")
-    verify(path)
-    try:
-        components = Checkpoint.manifest(path)["components"]
-    except (CheckpointError, OSError, TypeError, AttributeError, ValueError) as error:
-        raise BadInput(path, f"not a checkpoint of deepracer-exp: {_one_line(error)}") from error
-    if AGENT not in components or not components.keys() <= {AGENT, TRAINING}:
-        held = ", ".join(components) or "nothing"
-        raise BadInput(path, f"not a checkpoint of deepracer-exp: holds {held}")
-    for name, record in components.items():
-        folder = path / record["path"]  # torchrl lets no absolute path and no `..` pass
-        there = {file.name for file in folder.iterdir()} if folder.is_dir() else set()
-        if record["adapter"] != StateDictCheckpointAdapter.adapter_id or there != _STATE:
-            parts = " and ".join(sorted(_STATE))
-            raise BadInput(path, f"not a checkpoint of deepracer-exp: {name} is not {parts}")
-        _check_archive(folder / "state.tdz")
+    path, components = check_folder(path, (AGENT,), (AGENT, TRAINING))
     if resumable and TRAINING not in components:
         raise BadInput(path, "contains only the policy, so a training cannot resume from it")
     return path
@@ -146,18 +99,19 @@ def read_policy(experiment: Experiment, path: Path) -> StoredPolicy:
     Raises:
         BadInput: it does not fit the experiment, or a weight is not finite.
     """
-    networks = build_actor_critic(
+    networks = build_networks(
         experiment.network,
+        experiment.algorithm,
         observation_shape(experiment.observation),
         build_action_space(experiment.action_space).n,
         torch.Generator(),
     )
     stored, problem = State({}), "does not fit the run's config.yaml"
-    counters = _load(path, AGENT, stored, problem)
+    counters = load_component(path, AGENT, stored, problem)
     try:
         networks.load_state_dict(stored.values["networks"])
     except (KeyError, RuntimeError) as error:
-        raise BadInput(path, f"{problem}: {_one_line(error)}") from error
+        raise BadInput(path, f"{problem}: {one_line(error)}") from error
     for key, value in networks.state_dict().items():
         if not torch.isfinite(value).all():
             raise BadInput(path, f"{key} is not finite; choose another checkpoint")
@@ -170,7 +124,7 @@ def read_agent(path: Path, agent: Algorithm) -> None:
     Raises:
         BadInput: it does not fit.
     """
-    _load(path, AGENT, agent, "cannot be used")
+    load_component(path, AGENT, agent, "cannot be used")
 
 
 def read_training(path: Path) -> dict[str, Any]:
@@ -182,52 +136,8 @@ def read_training(path: Path) -> dict[str, Any]:
         BadInput: there is none, or it cannot be read.
     """
     state = State({})
-    _load(path, TRAINING, state, "a training cannot resume from it")
+    load_component(path, TRAINING, state, "a training cannot resume from it")
     return dict(state.values)
-
-
-class State:
-    """Plain values as a component of a checkpoint."""
-
-    def __init__(self, values: Mapping[str, Any]):
-        self.values = values
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the values."""
-        return dict(self.values)
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Replace the values."""
-        self.values = state
-
-
-def _load(path: Path, component: str, target: Any, problem: str) -> dict[str, Any]:
-    """Load a component into `target` and return the checkpoint's counters."""
-    archive = Checkpoint().register(component, target, adapter=StateDictCheckpointAdapter("archive"))
-    try:
-        return dict(archive.load(path).manifest["metadata"])
-    except (CheckpointError, OSError) as error:
-        raise BadInput(path, f"{problem}: {_one_line(error)}") from error
-
-
-def _check_archive(file: Path) -> None:
-    """Refuse an archive with anything but tensors, or one that takes more memory than it has bytes."""
-    size = file.stat().st_size
-    try:
-        with zipfile.ZipFile(file) as archive:
-            foreign = [name for name in archive.namelist() if not _MEMBER.fullmatch(name)]
-            unpacked = sum(member.file_size for member in archive.infolist())
-    except (zipfile.BadZipFile, OSError, EOFError) as error:
-        raise BadInput(file, f"corrupt: {error}") from error
-    if foreign:
-        raise BadInput(file, f"contains {foreign[0]}, which is not a tensor; a pickle is never loaded")
-    # Ours are not compressed, and no two tensors share bytes.
-    if unpacked > size:
-        raise BadInput(file, f"{size:,} bytes that unpack to {unpacked:,}", "tensors that are not compressed")
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:300]
 
 
 class CheckpointStore:
@@ -254,6 +164,7 @@ class CheckpointStore:
         self.folder = run_dir / CHECKPOINTS
         self.folder.mkdir(exist_ok=True)
         self._keep, self._every = keep, every or 1
+        self._replay = ReplayParts(run_dir)
         for path in self.folder.glob(".*"):
             _remove(path)
         restore_links(self.folder)
@@ -270,7 +181,7 @@ class CheckpointStore:
         """Save the agent under the number of its iteration.
 
         Args:
-            agent: networks, optimizer and schedule.
+            agent: networks, optimizer and schedule, and where it has one a replay, which is written beside it.
             counters: iteration, env steps and the like, JSON types.
             training: the rest of what a resumed training needs: tensors, arrays and JSON types; None: no training
                 can resume from here, and the checkpoint is not `last`.
@@ -280,6 +191,9 @@ class CheckpointStore:
             OSError, RunFailed: the folder cannot be written; what was there before is unchanged.
         """
         name = checkpoint_name(counters["iteration"])
+        replay = None if training is None else agent.replay
+        if replay is not None:
+            self._replay.write(replay)
         if not (self.folder / name).exists():  # nothing is learned between two updates
             self._write(name, agent, counters, training)
         if best:
@@ -287,6 +201,17 @@ class CheckpointStore:
         if training is not None:
             self._link("last", name)
         self._prune()
+        if replay is not None:
+            self._replay.drop(replay)
+
+    def restore_replay(self, agent: Algorithm) -> None:
+        """Give an agent whose state was read the steps of its replay, and remove those that came later.
+
+        Raises:
+            BadInput: some are missing or corrupt.
+        """
+        if agent.replay is not None:
+            self._replay.restore(agent.replay)
 
     def mark_best(self, iteration: int) -> None:
         """Let `best` lead to an iteration's checkpoint; the one before stays, for a resumed run, whose best it is."""

@@ -8,6 +8,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import Field, TypeAdapter
 
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.learning import PPOConfig
 from deepracer_exp.config.stored import ABSENT, config_differences, describe_differences
 from deepracer_exp.env.action_space import build_action_space, describe_actions
 from deepracer_exp.errors import BadInput
@@ -58,7 +59,7 @@ def refuse_other_networks(parent: Experiment, clone: Experiment) -> None:
     """Refuse a clone for which the parent's networks were not made.
 
     Raises:
-        BadInput: networks, sensors, features or actions differ.
+        BadInput: networks, algorithm, sensors, features or actions differ.
     """
     why = "the parent's networks were made for it; train a new run for another"
     if clone.network != parent.network:
@@ -66,6 +67,14 @@ def refuse_other_networks(parent: Experiment, clone: Experiment) -> None:
             describe_differences(config_differences([vars(parent.network), vars(clone.network)]))
         )
         raise BadInput("network", f"cannot be changed in a clone: {changed}; {why}")
+    kinds = [
+        "PPO"
+        if isinstance(algorithm, PPOConfig)
+        else "SAC" + " with a value network" * algorithm.value_network
+        for algorithm in (parent.algorithm, clone.algorithm)
+    ]
+    if kinds[0] != kinds[1]:
+        raise BadInput("algorithm", f"cannot be changed in a clone: {kinds[0]} -> {kinds[1]}; {why}")
     before, after = (
         {name: sensor and vars(sensor) for name, sensor in (("camera", seen.camera), ("lidar", seen.lidar))}
         for seen in (parent.observation, clone.observation)

@@ -25,7 +25,7 @@ from deepracer_exp.aws.logs.recording import (
     typed_table,
 )
 from deepracer_exp.aws.models.model_metadata import ModelMetadata
-from deepracer_exp.config.custom_files import TAKEN
+from deepracer_exp.config.custom_files import SAC_TAKEN, TAKEN
 from deepracer_exp.config.driving import ActionSpaceConfig
 from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.env.trace import EPISODE_STATUS, SCHEMA
@@ -252,7 +252,8 @@ def _hyperparameters(config: Mapping[str, Any]) -> dict[str, Any] | None:
     algorithm = config.get("algorithm")
     if not isinstance(algorithm, Mapping):
         return None
-    keys = {word: key.removeprefix("algorithm.") for word, key in TAKEN.items()}
+    taken = SAC_TAKEN if "replay_steps" in algorithm else TAKEN
+    keys = {word: key.removeprefix("algorithm.") for word, key in taken.items()}
     return {word: algorithm[key] for word, key in keys.items() if algorithm.get(key) is not None}
 
 

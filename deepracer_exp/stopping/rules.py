@@ -10,6 +10,7 @@ from deepracer_exp.config.stopping import (
     ConvergedRule,
     EntropyStopping,
     LapsSlowerRule,
+    NotLearningRule,
     PlateauStopping,
     ReliableStopping,
     StoppingConfig,
@@ -93,6 +94,22 @@ def entropy_share(entropy: float, at_start: float, action_count: int | None) -> 
     return entropy / math.log(action_count) if action_count > 1 else 0.0
 
 
+def entropy_over_target(entropy: float, target: float, action_count: int | None) -> float:
+    """Return the entropy of a policy that is led to a target, as SAC's is by its temperature, as a share of it.
+
+    Args:
+        entropy: in nats.
+        target: in nats.
+        action_count: as of `entropy_share`.
+
+    Returns:
+        1 at the target; of a continuous policy the ratio of the spreads, as in `entropy_share`.
+    """
+    if action_count is None:
+        return entropy_share(entropy, target, None)
+    return entropy / target if target > 0 else 1.0
+
+
 class StoppingRule:
     """Never ends a run (`stopping=none`); base class of all rules, yours included.
 
@@ -132,6 +149,7 @@ class TrendRule(StoppingRule):
         self._config = config
         self._action_count = action_count
         self._entropy_at_start: float | None = None
+        self._is_led = False
         self._before = (0, 0)
         self.averages = {
             name: Average(config.window) for name in (*_GROWTH, "entropy", *EVALUATED, _LAP_SPEED)
@@ -157,6 +175,10 @@ class TrendRule(StoppingRule):
         share = None
         if entropy is not None and self._entropy_at_start is not None:
             share = entropy_share(entropy, self._entropy_at_start, self._action_count)
+            target = row.get("target_entropy")
+            if target is not None:
+                self._is_led = True
+                share = entropy_over_target(entropy, target, self._action_count)
         return {
             "entropy": share,
             _LAP_SPEED: 1 / lap_s if (lap_s := reliable_lap_s(row)) else None,
@@ -178,7 +200,7 @@ class TrendRule(StoppingRule):
     def _entropy(self, config: EntropyStopping) -> Decision | None:
         rules: tuple[tuple[str, Any, tuple[str, ...], Callable[..., Reason | None]], ...] = (
             ("collapsed", config.collapsed, ("entropy", "completion"), trends.collapsed),
-            ("not_learning", config.not_learning, ("entropy", "completion"), trends.not_learning),
+            ("not_learning", config.not_learning, ("entropy", "completion"), self._not_learning),
             ("overfitting", config.overfitting, ("held_out_completion", "mean_return"), trends.overfits),
             ("laps_slower", config.laps_slower, (_LAP_SPEED, "mean_return"), self._laps_slower),
             ("converged", config.converged, _GROWTH, self._converged),
@@ -193,6 +215,9 @@ class TrendRule(StoppingRule):
             ):
                 return _decision(name, *reason, rule)
         return None
+
+    def _not_learning(self, rule: NotLearningRule, entropy: Average, completion: Average) -> Reason | None:
+        return trends.not_learning(rule, entropy, completion, is_led=self._is_led)
 
     def _laps_slower(self, rule: LapsSlowerRule, speed: Average, returns: Average) -> Reason | None:
         scores_s = self._race_scores_s

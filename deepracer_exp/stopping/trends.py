@@ -80,13 +80,23 @@ def collapsed(rule: CollapsedRule, entropy: Average, completion: Average) -> Rea
     return why, {"entropy": highest, "completion": best}
 
 
-def not_learning(rule: NotLearningRule, entropy: Average, completion: Average) -> Reason | None:
-    """Return why a policy that has hardly changed since the start should end."""
+def not_learning(
+    rule: NotLearningRule, entropy: Average, completion: Average, is_led: bool = False
+) -> Reason | None:
+    """Return why a policy that has hardly changed since the start should end.
+
+    With `is_led` its entropy follows a target, whether it learns or not, so that its completion alone decides.
+    """
     lowest, best = min(entropy.last(rule.patience)), max(completion.last(rule.patience))
     start = completion.first
-    if lowest <= rule.entropy_near or best - start > rule.completion_gain or best >= rule.completion_poor:
+    if (
+        (lowest <= rule.entropy_near and not is_led)
+        or best - start > rule.completion_gain
+        or best >= rule.completion_poor
+    ):
         return None
-    why = f"entropy still at {lowest:.1%}, completion {start:.1f}% at the start and {best:.1f}% since"
+    at_entropy = f"entropy at {lowest:.1%} of its target" if is_led else f"entropy still at {lowest:.1%}"
+    why = f"{at_entropy}, completion {start:.1f}% at the start and {best:.1f}% since"
     return why, {"entropy": lowest, "completion_start": start, "completion": best}
 
 

@@ -25,7 +25,7 @@ from deepracer_exp.runs.lineage import Lineage, read_lineage, refuse_other_netwo
 from .plan import TrainPlan, plan_training
 
 if TYPE_CHECKING:
-    from deepracer_exp.agents.actor_critic import ActorCritic
+    from deepracer_exp.agents.actor_critic import PolicyNetworks
 
 SLOWER = 0.1
 """A clone's learning rate over its parent's, where none is given: what racers do with a good model."""
@@ -59,7 +59,7 @@ def plan_clone(parent: StoredRun, changes: Sequence[str], *, stored: bool = Fals
     return plan
 
 
-def read_parent(parent: StoredRun, clone: Experiment) -> "tuple[ActorCritic, Lineage]":
+def read_parent(parent: StoredRun, clone: Experiment) -> "tuple[PolicyNetworks, Lineage]":
     """Read the networks that a clone begins with, and whose they were; their checkpoint is pinned.
 
     Raises:

@@ -89,6 +89,13 @@ def _import(model: StoredModel, path: str, aside: str, name: str, changes: Seque
         )
     files = read_custom_files(aside)
     assert files.metadata is not None
+    if files.is_sac:
+        raise BadInput(
+            path,
+            "model_metadata.json: training_algorithm: sac: weights of SAC cannot be used",
+            f"a model of clipped_ppo, or {KEY}=DIR with its files alone, which trains a new one with "
+            "algorithm=sac_service",
+        )
     seen = sensor_overrides(files.metadata)
     experiment, composition, networks, network, absent = _fit(model, files, seen, name, changes)
     load_reward_source(experiment.reward)

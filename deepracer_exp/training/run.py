@@ -3,7 +3,6 @@
 import ast
 import json
 import logging
-import math
 import os
 import shutil
 import time
@@ -14,15 +13,15 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-import psutil
 import torch
 from rich.console import Console
 
-from deepracer_exp.agents.actor_critic import ActorCritic
+from deepracer_exp.agents.actor_critic import PolicyNetworks
 from deepracer_exp.collectors.ray_cluster import check_collector
 from deepracer_exp.config import acting
 from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.learning import PPOConfig, SACConfig
 from deepracer_exp.config.own_class import own_classes
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.errors import NO_MEMORY, BadInput, RunFailed, count, is_refused_memory, reading
@@ -52,6 +51,7 @@ from deepracer_exp.tracking.tracking_file import TrackedRun, begin_again, read_t
 from .budget import refuse_spent
 from .callbacks import standard_callbacks
 from .clone import describe_clone, read_parent
+from .memory import memory_needed
 from .metrics import track_names
 from .plan import ResumePlan, TrainPlan
 from .signals import Interruption
@@ -59,10 +59,6 @@ from .teacher import check_teacher, keep_teacher
 from .trainer import Callback, TakenOver, Trainer, TrainResult
 
 logger = logging.getLogger("deepracer_exp")
-
-_COPIES_OF_PICTURES = 8
-"""Copies of a step's picture at the peak of an iteration: before and after it, in workers, batch and shuffled steps.
-Measured: 7.1 with collector=in_process, 7.8 with sync."""
 
 
 def run_training(
@@ -99,13 +95,13 @@ def run_training(
             for note in describe_clone(plan.parent, plan.experiment, start[1]):
                 _printing(console)(note)
         setup = try_out(plan)
-        memory = memory_of_pictures(plan.experiment)
+        memory = memory_needed(plan.experiment)
         trainer = _begin(plan, setup, console, start, callbacks, run_name, tags, created)
         _print_memory(memory, console)
         return _run(trainer, interruption)
 
 
-def store_run(plan: TrainPlan, networks: ActorCritic, reason: str) -> TrainResult:
+def store_run(plan: TrainPlan, networks: PolicyNetworks, reason: str) -> TrainResult:
     """Make a run of networks that were trained elsewhere, as if its training had ended before it began.
 
     The reward function is not run. `networks` are its checkpoint, best and last; `reason` says in the summary where
@@ -176,6 +172,13 @@ def _try(experiment: Experiment, setup: RaceSetup) -> None:
     Raises:
         BadInput: one of them cannot be used.
     """
+    algorithm = experiment.algorithm
+    if isinstance(algorithm, SACConfig) and algorithm.value_network and setup.actions.n is not None:
+        raise BadInput(
+            "algorithm.value_network=true",
+            f"the service's SAC has no list of {count(setup.actions.n, 'action')}",
+            "action_space=continuous, or algorithm=sac, which also learns a list",
+        )
     RewardFunction(setup.reward, 1, setup.reward_time_limit_s, None)
     with reading(f"car {experiment.car.name}", "dimensions, masses and settings of a car that can stand"):
         CarBatch(setup.car, 1, 1)
@@ -188,36 +191,11 @@ def _try(experiment: Experiment, setup: RaceSetup) -> None:
         )
 
 
-def memory_of_pictures(experiment: Experiment) -> str | None:
-    """Return a line that says how much memory the pictures of an iteration take; None: there are none.
-
-    Raises:
-        BadInput: more than is free.
-    """
-    camera, algorithm = experiment.observation.camera, experiment.algorithm
-    if camera is None:
-        return None
-    bytes_per_step, free = _COPIES_OF_PICTURES * math.prod(camera.shape), psutil.virtual_memory().available
-    steps = algorithm.frames_per_iteration or 1000  # how long episodes will be is not known
-    needed = steps * bytes_per_step
-    if algorithm.frames_per_iteration is not None and needed > free:
-        raise BadInput(
-            f"algorithm.frames_per_iteration={steps}: the pictures of so many steps take {needed / 1e9:.1f} GB of "
-            f"memory, and {free / 1e9:.1f} GB are free; accepted: up to {free // bytes_per_step}, or smaller or fewer "
-            "pictures (observation.camera)"
-        )
-    each = "the" if algorithm.frames_per_iteration is not None else "each"
-    return (
-        f"pictures: {needed / 1e9:.1f} GB of memory for {each} {steps:,} steps of an iteration, "
-        f"{free / 1e9:.1f} GB are free"
-    )
-
-
 def _begin(
     plan: TrainPlan,
     setup: RaceSetup,
     console: Console,
-    start: tuple[ActorCritic, Lineage | None] | None,
+    start: tuple[PolicyNetworks, Lineage | None] | None,
     callbacks: Sequence[Callback] = (),
     run_name: str | None = None,
     tags: Mapping[str, str] = MappingProxyType({}),
@@ -241,7 +219,7 @@ def _begin(
             keep_teacher(teacher, folder.path)
         trainer = Trainer(experiment, setup, folder, composition.mapping, every)
         if start is not None:
-            trainer.networks.load_state_dict(start[0].state_dict())
+            trainer.agent.begin_with(start[0])
         if lineage is not None:
             folder.write(LINEAGE, json.dumps(asdict(lineage), indent=2) + "\n")
         if created is not None:
@@ -304,7 +282,7 @@ def _reopen(
     run_dir, experiment, composition = plan.run_dir, plan.experiment, plan.composition
     names = plan.provenance.get("names", {})
     setup = build_setup(experiment)
-    memory = memory_of_pictures(experiment)
+    memory = memory_needed(experiment)
     checkpoint = intact_checkpoint(run_dir / CHECKPOINTS, "last", resumable=True)
     state = read_training(checkpoint)
     refuse_changes(run_dir, state, composition.mapping, setup)
@@ -366,10 +344,10 @@ def _forget_damaged_best(run_dir: Path, state: dict[str, Any]) -> None:
         state["best"] = None
 
 
-def _print_memory(memory: str | None, console: Console) -> None:
-    if memory is not None:
-        logger.info(memory)
-        _printing(console)(memory)
+def _print_memory(memory: Sequence[str], console: Console) -> None:
+    for line in memory:
+        logger.info(line)
+        _printing(console)(line)
 
 
 def _printing(console: Console) -> Callable[[str], None]:
@@ -435,7 +413,8 @@ def _differences_to_uninterrupted(experiment: Experiment, setup: RaceSetup) -> l
     by_clock = [name for name in clocks if getattr(experiment.budget, name) is not None]
     if by_clock and getattr(experiment.lr_schedule, "by", "fraction") == "fraction":
         why.append(f"the learning rate follows the clock (budget.{by_clock[0]}, lr_schedule.by=fraction)")
-    if by_clock and experiment.algorithm.entropy_end_factor != 1:
+    algorithm = experiment.algorithm
+    if by_clock and isinstance(algorithm, PPOConfig) and algorithm.entropy_end_factor != 1:
         why.append(
             f"the entropy bonus follows the clock (budget.{by_clock[0]}, algorithm.entropy_end_factor)"
         )

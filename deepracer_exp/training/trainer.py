@@ -14,8 +14,8 @@ import psutil
 import torch
 from tensordict import TensorDictBase
 
-from deepracer_exp.agents.actor_critic import build_actor_critic
-from deepracer_exp.agents.ppo import UpdateMetrics, build_agent
+from deepracer_exp.agents.algorithm import UpdateMetrics
+from deepracer_exp.agents.build import build_agent, build_networks
 from deepracer_exp.collectors.base import Collector
 from deepracer_exp.collectors.collector import open_collector
 from deepracer_exp.config.experiment import Experiment
@@ -178,8 +178,12 @@ class Trainer:
         torch.set_num_threads(1)
         generator = torch.Generator().manual_seed(experiment.seed)
         with reading(f"network={experiment.network}", "a network that fits into memory"):
-            self.networks = build_actor_critic(
-                experiment.network, observation_shape(experiment.observation), setup.actions.n, generator
+            self.networks = build_networks(
+                experiment.network,
+                experiment.algorithm,
+                observation_shape(experiment.observation),
+                setup.actions.n,
+                generator,
             )
         self.agent = build_agent(
             self.networks,
@@ -308,6 +312,7 @@ class Trainer:
             BadInput: it does not fit the experiment.
         """
         read_agent(checkpoint, self.agent)
+        self.checkpoints.restore_replay(self.agent)
         self.iteration, self.env_steps = state["iteration"], state["env_steps"]
         self.metrics.load_state_dict(state["results"])
         self._first_lap, self._cars = state["first_lap"], state["cars"]
@@ -450,7 +455,7 @@ class Trainer:
         return {
             **self.counters(),
             **self.metrics.row(finished),
-            **{name: float(value) for name, value in vars(update).items()},
+            **{name: None if value is None else float(value) for name, value in vars(update).items()},
             **NOT_EVALUATED,
             "wall_clock_s": round(self.wall_clock_s, 3),
             "collect_s": round(collect_s, 4),

@@ -10,10 +10,10 @@ from deepracer_exp.agents.actor_critic import ActorCritic, build_actor_critic
 from deepracer_exp.agents.ppo import PPO
 from deepracer_exp.agents.schedules import PresetSchedule
 from deepracer_exp.config.driving import ObservationShape
-from deepracer_exp.config.learning import AdaptiveKLLR, AlgorithmConfig, MLPConfig
+from deepracer_exp.config.learning import AdaptiveKLLR, MLPConfig, PPOConfig
 from deepracer_exp.errors import RunFailed
 
-CONFIG = AlgorithmConfig(
+CONFIG = PPOConfig(
     lr=3e-3,
     batch_size=64,
     epochs=4,

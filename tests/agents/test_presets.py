@@ -5,16 +5,19 @@ import torch
 from tensordict import TensorDict
 
 from deepracer_exp.agents.actor_critic import Attention, SensorNet, build_actor_critic
+from deepracer_exp.agents.build import build_agent, build_networks
 from deepracer_exp.agents.ppo import PPO
+from deepracer_exp.agents.sac import SAC
 from deepracer_exp.agents.schedules import PresetSchedule
 from deepracer_exp.config.compose import compose_option
 from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.config.learning import (
-    AlgorithmConfig,
     CNNConfig,
     LRScheduleConfig,
     MLPConfig,
     NetworkConfig,
+    OneAlgorithm,
+    PPOConfig,
 )
 from deepracer_exp.config.options import options
 
@@ -44,10 +47,12 @@ def test_every_schedule_keeps_a_positive_rate_over_a_run(name):
 
 @pytest.mark.parametrize("name", options("algorithm"))
 def test_every_algorithm_builds_and_names_one_length_of_an_iteration(name):
-    config = compose_option("algorithm", name, AlgorithmConfig)
+    config = compose_option("algorithm", name, OneAlgorithm)
     network = compose_option("network", "mlp_small", MLPConfig)
-    networks = build_actor_critic(network, ObservationShape(11), 7, torch.Generator())
-    PPO(networks, config, PresetSchedule(compose_option("lr_schedule", "constant", LRScheduleConfig)), seed=0)
+    actions = None if getattr(config, "value_network", False) else 7
+    networks = build_networks(network, config, ObservationShape(11), actions, torch.Generator())
+    agent = build_agent(networks, config, compose_option("lr_schedule", "constant", LRScheduleConfig), seed=0)
+    assert isinstance(agent, PPO if isinstance(config, PPOConfig) else SAC)
     assert (config.frames_per_iteration is None) != (config.episodes_per_iteration is None)
 
 

@@ -10,7 +10,9 @@ from tensordict import TensorDict
 from torchrl.checkpoint import Checkpoint
 
 from deepracer_exp.agents.actor_critic import ActorCritic, build_actor_critic
-from deepracer_exp.agents.ppo import PPO, Algorithm, Distillation, build_agent
+from deepracer_exp.agents.algorithm import Algorithm
+from deepracer_exp.agents.build import build_agent
+from deepracer_exp.agents.ppo import PPO, Distillation
 from deepracer_exp.agents.smoothness import Smoothness
 from deepracer_exp.config import acting
 from deepracer_exp.config.compose import compose_option

@@ -76,7 +76,7 @@ def test_settings_are_found_in_every_layout_that_has_them(place, layout):
 
 @pytest.mark.parametrize("name", ["ip/hyperparameters.json", "sagemaker.log"])
 def test_a_hyperparameter_that_is_not_accepted_is_listed_and_the_others_are_kept(tmp_path, name):
-    known = {**made.HYPERPARAMETERS, "exploration_type": "additive_noise", "sac_alpha": 0.3}
+    known = {**made.HYPERPARAMETERS, "exploration_type": "boltzmann", "sac_alpha": 0.3}
     files = made.training_csvs("training-simtrace")
     files[name] = json.dumps(known)
     if name.endswith(".log"):
@@ -84,7 +84,7 @@ def test_a_hyperparameter_that_is_not_accepted_is_listed_and_the_others_are_kept
     recording = read_recording(made.write_folder(files, tmp_path))
     assert recording.hyperparameters == {**made.HYPERPARAMETERS, "sac_alpha": 0.3}
     (problem,) = recording.problems
-    assert 'exploration_type: "additive_noise"; accepted: categorical, e-greedy' in problem.reason
+    assert 'exploration_type: "boltzmann"; accepted: categorical, e-greedy, additive_noise' in problem.reason
 
 
 @pytest.mark.parametrize("layout", ["console", "droa"])

@@ -9,8 +9,9 @@ from deepracer_exp.aws.models import hyperparameters, model_metadata
 from deepracer_exp.config.compose import Composition, compose_experiment, expand_grid
 from deepracer_exp.config.custom_files import TAKEN, FileOverrides, file_overrides, read_custom_files
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.learning import PPOConfig, SACConfig
 from deepracer_exp.config.overrides import override_line, parse_single
-from deepracer_exp.config.parse import parse_experiment
+from deepracer_exp.config.parse import parse_config, parse_experiment
 from deepracer_exp.errors import BadInput
 from tests.conftest import refused
 
@@ -149,6 +150,43 @@ def test_every_hyperparameter_is_taken_or_named(custom_files, key):
     assert new == ({override_line(TAKEN[key], other)} if key in TAKEN else set())
 
 
+SAC_FILE = {"batch_size": 32, "lr": 2e-4, "discount_factor": 0.98, "loss_type": "mean squared error"} | {
+    "exploration_type": "additive_noise",
+    "num_episodes_between_training": 20,
+    "sac_alpha": 0.35,
+}
+
+
+@pytest.mark.parametrize("metadata", [CONTINUOUS | {"training_algorithm": "sac"}, None])
+def test_files_of_sac_train_with_the_services_sac_and_name_what_has_no_effect(custom_files, metadata):
+    found = overrides_of(folder := custom_files(SAC_FILE, metadata))
+    algorithm = compose_experiment([f"custom_files={folder}"])[0].algorithm
+    assert isinstance(algorithm, SACConfig)
+    assert (algorithm.alpha, algorithm.learn_alpha, algorithm.tau) == (0.35, False, None)
+    assert (algorithm.lr, algorithm.batch_size, algorithm.discount) == (2e-4, 32, 0.98)
+    assert (algorithm.episodes_per_iteration, algorithm.frames_per_iteration) == (1, None)
+    notes = " ".join(found.notes)
+    assert "algorithm=sac_service" in notes
+    assert "num_episodes_between_training=20: not applicable" in notes
+    assert "exploration_type" not in notes
+    assert "sac_alpha=0.35: not applicable" not in notes
+
+
+def test_an_algorithm_beside_files_of_sac_wins(custom_files):
+    folder = custom_files(SAC_FILE, CONTINUOUS | {"training_algorithm": "sac"})
+    experiment, composition = compose_experiment([f"custom_files={folder}", "algorithm=ppo"])
+    assert isinstance(experiment.algorithm, PPOConfig)
+    assert any("sac_alpha=0.35: not used, because of algorithm=ppo" in note for note in composition.notes)
+
+
+def test_imported_files_of_sac_become_options_of_the_same_training(custom_files, call):
+    folder = custom_files(SAC_FILE, CONTINUOUS | {"training_algorithm": "sac"})
+    direct = compose_experiment([f"custom_files={folder}"])[0].algorithm
+    assert call("import", str(folder), "--name", "soft").code == 0
+    shown = yaml.safe_load(call("train", "experiment=soft", "--cfg").stdout)
+    assert parse_config(shown["algorithm"], SACConfig) == direct
+
+
 def test_every_key_of_the_metadata_is_taken_or_named(custom_files):
     notes = overrides_of(custom_files()).notes
     for key in model_metadata.KEYS:
@@ -256,8 +294,8 @@ def test_what_is_no_folder_is_refused(custom_files, tmp_path):
         ({"hyperparameters": '{"lr": NaN}'}, ["hyperparameters.json: lr: NaN", "1e-10 to 1"]),
         ({"metadata": "{}"}, ["model_metadata.json: action_space: missing"]),
         (
-            {"metadata": CONTINUOUS | {"training_algorithm": "sac"}},
-            ["training_algorithm: sac", "clipped_ppo"],
+            {"metadata": METADATA | {"training_algorithm": "sac"}},
+            ["training_algorithm", "SAC has no discrete actions"],
         ),
     ],
 )

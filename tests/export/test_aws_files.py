@@ -41,6 +41,27 @@ def test_what_is_exported_trains_the_same_when_it_comes_back(tmp_path, space):
     assert notes == []
 
 
+def test_files_of_sac_come_back_as_the_services_sac_with_the_same_hyperparameters(tmp_path):
+    overrides = (
+        "algorithm=sac_service",
+        "action_space=continuous",
+        "algorithm.alpha=0.3",
+        "algorithm.lr=2e-4",
+    )
+    texts, notes = files(*overrides)
+    write_files(texts, tmp_path / "aws")
+    back, _ = compose_experiment([f"custom_files={tmp_path / 'aws'}"])
+    assert back.algorithm == compose_experiment(overrides)[0].algorithm
+    assert json.loads(texts["model_metadata.json"])["training_algorithm"] == "sac"
+    assert json.loads(texts["hyperparameters.json"])["exploration_type"] == "additive_noise"
+    assert any("sac_alpha fixed" in note for note in notes)
+
+
+def test_files_of_sac_with_a_list_of_actions_are_refused():
+    with pytest.raises(BadInput, match=r"algorithm: SAC with a list of .* actions.*accepted: "):
+        files("algorithm=sac", "action_space=discrete")
+
+
 @pytest.mark.parametrize("car", ["deepracer_v4", "deepracer_v5", "deepracer_v6"])
 def test_an_exported_model_comes_back_to_its_car(tmp_path, car):
     write_files(files(f"car={car}")[0], tmp_path / "aws")

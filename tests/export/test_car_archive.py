@@ -13,9 +13,9 @@ import pytest
 import torch
 from torch import nn
 
-from deepracer_exp.agents.actor_critic import build_actor_critic
+from deepracer_exp.agents.build import build_networks
 from deepracer_exp.aws.models.car_archive import check_weights, name_on_car
-from deepracer_exp.aws.models.graph_def import INPUTS, POLICY, read_weights
+from deepracer_exp.aws.models.graph_def import HEAD, INPUTS, POLICY, read_weights
 from deepracer_exp.aws.models.model_metadata import read_model_metadata
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.action_space import ContinuousActions, build_action_space
@@ -48,8 +48,12 @@ def exported(*overrides: str) -> Exported:
     experiment, _ = compose_experiment(overrides)
     actions = build_action_space(experiment.action_space)
     generator = torch.Generator().manual_seed(0)
-    networks = build_actor_critic(
-        experiment.network, observation_shape(experiment.observation), actions.n, generator
+    networks = build_networks(
+        experiment.network,
+        experiment.algorithm,
+        observation_shape(experiment.observation),
+        actions.n,
+        generator,
     )
     layers = [module for module in networks.policy_head.modules() if isinstance(module, nn.Linear)]
     with torch.no_grad():  # a fresh head's outputs hardly differ
@@ -149,6 +153,16 @@ def test_a_graph_with_other_weights_is_not_written():
             check_weights(graph, other)
 
 
+def test_an_archive_of_sac_writes_the_means_alone_and_cannot_be_taken_for_a_policy_of_ppo(tmp_path, call):
+    one = small(*SMALL, "algorithm=sac", "action_space=continuous")
+    weights = read_weights("model.pb", one.files["agent/model.pb"], has_tangent=True)
+    assert weights[f"{HEAD}/policy_mean/kernel"].shape[1] == len(weights[f"{HEAD}/policy_mean/bias"]) == 2
+    with pytest.raises(BadInput, match="policy of SAC"):
+        read_weights("model.pb", one.files["agent/model.pb"])
+    (tmp_path / "soft.tar.gz").write_bytes(one.archive.content)
+    call("import", "soft.tar.gz", "--name", "soft").assert_bad_input("policy of SAC")
+
+
 def test_models_are_named_as_the_car_names_them():
     assert name_on_car("my best.v2.tar.gz") == "my_best"
 
@@ -196,6 +210,9 @@ KINDS = [
     ("observation=camera_lidar", "network=shallow"),
     ("observation=camera_lidar", "observation.lidar.kind=sectors", "action_space=continuous"),
     ("observation=camera_lidar", "observation.camera.stereo_m=0.06"),
+    ("observation=camera", "network=shallow", "algorithm=sac", "action_space=continuous"),
+    ("observation=camera", "network=cnn_small", "algorithm=sac", "action_space=continuous", *LEFT),
+    ("observation=camera", "network=cnn_small", "algorithm=sac", "action_space=discrete"),
 ]
 
 

@@ -12,7 +12,8 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from deepracer_exp.agents.actor_critic import ActorCritic, build_actor_critic
+from deepracer_exp.agents.actor_critic import PolicyNetworks
+from deepracer_exp.agents.build import build_networks
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.env.action_space import ActionSpace, build_action_space
@@ -25,11 +26,11 @@ OBSERVATIONS = torch.randn(50, len(FEATURES), generator=torch.Generator().manual
 SHAPE, FACTS = ObservationShape(len(FEATURES)), {"run": "a", "features": FEATURES}
 
 
-def policy(*overrides: str, seed: int = 0) -> tuple[ActorCritic, ActionSpace]:
+def policy(*overrides: str, seed: int = 0) -> tuple[PolicyNetworks, ActionSpace]:
     experiment, _ = compose_experiment(overrides)
     actions = build_action_space(experiment.action_space)
     generator = torch.Generator().manual_seed(seed)
-    networks = build_actor_critic(experiment.network, SHAPE, actions.n, generator)
+    networks = build_networks(experiment.network, experiment.algorithm, SHAPE, actions.n, generator)
     with torch.no_grad():  # a fresh head's outputs hardly differ
         for parameter in networks.policy_head.parameters():
             parameter.mul_(3.0)
@@ -41,7 +42,7 @@ class Written:
     """A file and what it was made of."""
 
     path: Path
-    networks: ActorCritic
+    networks: PolicyNetworks
     actions: ActionSpace
 
     @functools.cached_property
@@ -76,6 +77,8 @@ def programmed(default: Written, monkeypatch: pytest.MonkeyPatch) -> None:
         ("action_space=grid", "network=mlp_small_shared", "network.activation=silu"),
         ("action_space=continuous", "network=mlp_small", "network.activation=tanh"),
         ("action_space=continuous", "network=mlp_small_shared", "network.activation=elu"),
+        ("action_space=continuous", "algorithm=sac"),
+        ("action_space=discrete", "algorithm=sac"),
     ],
     ids=" ".join,
 )

@@ -238,6 +238,39 @@ def test_a_continuous_policy_that_keeps_its_scatter_is_not_learning():
     assert stopped_at(rows, rule(), None)[1].rule == "not_learning"
 
 
+def led(rows: list[dict], target: float) -> list[dict]:
+    """The same of a policy whose entropy a learned temperature leads to a target, in nats."""
+    return [row | {"target_entropy": target} for row in rows]
+
+
+@pytest.mark.parametrize("actions", [ACTIONS, None])
+def test_a_policy_led_to_a_lower_entropy_that_does_not_drive_better_is_not_learning(actions):
+    rows = led(history(completion=11.0, entropy=lambda i: max(0.3, 1 - 0.05 * i)), 0.3 * math.log(ACTIONS))
+    number, decision = stopped_at(rows, rule(), actions)
+    assert (decision.rule, decision.stopped_early) == ("not_learning", True)
+    assert number < 60
+    assert "of its target" in decision.why
+    assert stopped_at(led(history(completion=learned(60)), 1.0), rule())[1].rule == "converged"
+
+
+@pytest.mark.parametrize("actions", [ACTIONS, None])
+def test_a_policy_far_below_the_entropy_it_is_led_to_has_collapsed(actions):
+    target = 1.0
+    below = target - 7.0 if actions is None else 0.02 * target
+    rows = [
+        row | {"entropy": max(below, target - row["env_steps"] / 8192)}
+        for row in led(history(completion=20.0), target)
+    ]
+    assert stopped_at(rows, rule("stopping.not_learning=null"), actions)[1].rule == "collapsed"
+    near = [row | {"entropy": target - 0.1} for row in rows]
+    assert stopped_at(near, rule("stopping.not_learning=null"), actions)[1].rule != "collapsed"
+
+
+def test_a_fixed_temperature_has_no_target_and_is_judged_as_any_policy():
+    rows = history(**RANDOM)
+    assert stopped_at([row | {"target_entropy": None} for row in rows], rule()) == stopped_at(rows, rule())
+
+
 def test_reliable_looks_at_the_share_of_laps():
     rows = history(lap_share=lambda i: None if i < 5 else i / 100)
     number, decision = stopped_at(rows, rule("stopping.episodes=20", option="reliable"))

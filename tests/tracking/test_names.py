@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mlflow.utils.validation import _validate_metric_name
 
-from deepracer_exp.agents.ppo import UpdateMetrics
+from deepracer_exp.agents.sac import SACMetrics
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.options import options
 from deepracer_exp.tracking.metadata import (
@@ -63,7 +63,7 @@ def test_up_to_three_tracks_are_named_and_more_are_counted(names, label):
 
 
 def test_every_column_has_a_name_of_its_own_in_a_section_and_race_is_the_first():
-    columns = [*EVAL_COLUMNS, *(field.name for field in fields(UpdateMetrics)), *TRACK_METRICS]
+    columns = [*EVAL_COLUMNS, *(field.name for field in fields(SACMetrics)), *TRACK_METRICS]
     assert set(columns) <= set(METRICS)
     names = [metric_name(column) for column in METRICS]
     assert len(set(names)) == len(names)

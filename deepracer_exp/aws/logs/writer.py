@@ -73,10 +73,11 @@ def trainer_log(head: str, numbered: NumberedTraining, updates: pd.DataFrame) ->
                 lines.append(_episode_line(episode, driven, 0))
         row = losses.get(iteration)
         if row is not None:
-            lines.append(
-                f"Policy training> Surrogate loss={row['policy_loss']}, KL divergence={row['kl']}, "
-                f"Entropy={row['entropy']}, training epoch=0, learning_rate={row['lr']}"
-            )
+            if pd.notna(row["kl"]):  # of SAC the service logs no line
+                lines.append(
+                    f"Policy training> Surrogate loss={row['policy_loss']}, KL divergence={row['kl']}, "
+                    f"Entropy={row['entropy']}, training epoch=0, learning_rate={row['lr']}"
+                )
             lines.append(_saved(iteration + 1, driven))
     return "\n".join(lines) + "\n"
 

@@ -29,6 +29,7 @@ POLICY = f"{HEAD}/policy"
 
 GRAPH_BYTES = 2**28
 """Twice the service's largest graph, that of DEEP_CONVOLUTIONAL_NETWORK with its 56,000 inputs of a dense layer."""
+_TANGENT = f"{HEAD}/Tanh"
 _MOST_NODES = 20_000
 """The service's whole training graph has 3,730 nodes, a frozen one about 60."""
 _MOST_FIELDS = 200_000
@@ -42,6 +43,7 @@ def policy_graph(
     sensors: Mapping[str, Sequence[int]],
     strides: Sequence[int],
     bounds: tuple[Tensor, Tensor] | None = None,
+    tangent: tuple[Tensor, Tensor] | None = None,
 ) -> bytes:
     """Return the frozen graph of a policy: raw sensors in (pictures 0 to 255, LIDAR as it is), `POLICY` out.
 
@@ -52,6 +54,8 @@ def policy_graph(
             metadata's `sensor`.
         strides: of each convolution.
         bounds: lowest and highest value of each continuous output, (2,) each; None: it is not clipped.
+        tangent: factor and shift of the hyperbolic tangent of each continuous output, (2,) each; None: the output is
+            taken without it.
     """
     graph = _Graph()
     flattened = {}
@@ -76,6 +80,12 @@ def policy_graph(
         hidden = _activate(graph, name, _dense(graph, tensors, name, hidden))
     discrete = f"{HEAD}/policy_fc/kernel" in tensors
     output = _dense(graph, tensors, f"{HEAD}/policy_{'fc' if discrete else 'mean'}", hidden)
+    if tangent is not None:
+        output = graph.node(_TANGENT, "Tanh", output, T=_type(_FLOAT))
+        factor, shift = tangent
+        if (factor != 1).any() or shift.any():
+            output = graph.operate(f"{HEAD}/mul", "Mul", output, factor)
+            output = graph.operate(f"{HEAD}/add", "Add", output, shift)
     if bounds is not None:
         output = graph.operate(f"{HEAD}/Maximum", "Maximum", output, bounds[0])
         output = graph.operate(f"{HEAD}/Minimum", "Minimum", output, bounds[1])
@@ -212,7 +222,9 @@ def _integers(*values: int) -> bytes:
     return field(1, field(3, b"".join(map(varint, values))))
 
 
-def read_weights(path: str | Path, raw: bytes | None = None) -> dict[str, Tensor]:
+def read_weights(
+    path: str | Path, raw: bytes | None = None, *, has_tangent: bool = False
+) -> dict[str, Tensor]:
     """Return the kernels and biases of a frozen graph by the names of their nodes.
 
     Nothing is allocated from a size that the file declares: the tensors are views of its bytes, read-only.
@@ -220,9 +232,11 @@ def read_weights(path: str | Path, raw: bytes | None = None) -> dict[str, Tensor
     Args:
         path: of the file.
         raw: its content if known, e.g. of a member of an archive.
+        has_tangent: whether the policy's output may go through a hyperbolic tangent, as an exported SAC policy's does.
 
     Raises:
-        BadInput: it cannot be read, is larger than `GRAPH_BYTES`, or not a frozen graph.
+        BadInput: it cannot be read, is larger than `GRAPH_BYTES`, or not a frozen graph; or has such an output, with
+            which the weights alone are another policy.
     """
     accepted = "a frozen graph of TensorFlow 1 (.pb)"
     raw = read_bytes(path, accepted, GRAPH_BYTES) if raw is None else raw
@@ -237,6 +251,8 @@ def read_weights(path: str | Path, raw: bytes | None = None) -> dict[str, Tensor
             if nodes > _MOST_NODES:
                 raise ValueError(f"more than {_MOST_NODES:,} nodes")
             name, tensor = _constant(fields, _message(value))
+            if name == _TANGENT and not has_tangent:
+                raise ValueError("holds a policy of SAC, whose weights cannot be used")
             if tensor is not None:
                 if name in tensors:
                     raise ValueError(f"two nodes {name}")

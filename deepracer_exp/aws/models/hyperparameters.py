@@ -10,7 +10,7 @@ from deepracer_exp.errors import BadInput
 from .json_object import JsonObject
 
 LOSS_TYPES = ("huber", "mean squared error")
-EXPLORATION_TYPES = ("categorical", "e-greedy")
+EXPLORATION_TYPES = ("categorical", "e-greedy", "additive_noise")
 
 # What the service's trainer accepts; the console accepts less.
 _WHOLE = {
@@ -54,7 +54,8 @@ class Hyperparameters:
     discount_factor: float = 0.999
     loss_type: Literal["huber", "mean squared error"] = "mean squared error"
     num_episodes_between_training: int = 20
-    exploration_type: Literal["categorical", "e-greedy"] = "categorical"
+    exploration_type: Literal["categorical", "e-greedy", "additive_noise"] = "categorical"
+    """Files of SAC have `additive_noise`."""
     e_greedy_value: float = 0.05
     epsilon_steps: int = 10_000
     stack_size: int = 1

@@ -1,0 +1,85 @@
+"""The algorithm of an experiment, and the networks that it trains."""
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from deepracer_exp.config.driving import ObservationShape
+from deepracer_exp.config.learning import (
+    AlgorithmConfig,
+    LRScheduleConfig,
+    NetworkConfig,
+    PPOConfig,
+    SACConfig,
+)
+from deepracer_exp.config.own_class import OwnClass, build_own
+from deepracer_exp.errors import BadInput
+
+from .actor_critic import ActorCritic, PolicyNetworks, build_actor_critic
+from .algorithm import Algorithm
+from .ppo import PPO, Distillation
+from .sac import SAC
+from .schedules import build_schedule
+from .soft_actor_critic import SoftActorCritic, build_soft_actor_critic
+
+_CPU = torch.device("cpu")
+
+
+def build_networks(
+    network: NetworkConfig,
+    algorithm: AlgorithmConfig,
+    observed: ObservationShape,
+    action_count: int | None,
+    generator: torch.Generator | None,
+) -> PolicyNetworks:
+    """Build the networks that an algorithm trains; arguments and errors as of `build_actor_critic`."""
+    if isinstance(algorithm, SACConfig):
+        return build_soft_actor_critic(network, observed, action_count, generator, algorithm.value_network)
+    return build_actor_critic(network, observed, action_count, generator)
+
+
+def build_agent(
+    networks: PolicyNetworks,
+    config: AlgorithmConfig,
+    lr_schedule: LRScheduleConfig,
+    seed: int,
+    teacher: TensorDictModuleBase | None = None,
+    device: torch.device = _CPU,
+    commands: Tensor | None = None,
+) -> Algorithm:
+    """Return the algorithm of the group `algorithm`, with its learning-rate schedule.
+
+    Args:
+        networks: Of `build_networks`; updated by it in place.
+        config: The group `algorithm`.
+        lr_schedule: The group `lr_schedule`.
+        seed: Of the algorithm's own random streams.
+        teacher: A policy with the same actions that is imitated for the first `config.teacher_iterations`.
+        device: Where updates are computed; a class of the user's own chooses it itself.
+        commands: What the actions of a discrete policy mean, see `Smoothness`.
+
+    Raises:
+        BadInput: a class of the user's own cannot be used, or has no loss that could be smooth.
+    """
+    schedule = build_schedule(lr_schedule)
+    if isinstance(config, SACConfig):
+        assert isinstance(networks, SoftActorCritic)
+        return SAC(networks, config, schedule, seed, device)
+    assert isinstance(networks, ActorCritic)
+    assert isinstance(config, PPOConfig)
+    agent: Algorithm
+    if teacher is not None:
+        agent = Distillation(networks, config, schedule, seed, teacher, device)
+    elif config.target is None:
+        agent = PPO(networks, config, schedule, seed, device)
+    else:
+        described = OwnClass(target=config.target, kwargs=config.kwargs)
+        # Its constructor may draw weights; the global random state has no part in them.
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            agent = build_own(described, "algorithm.target", Algorithm, networks, config, schedule, seed)
+    if config.smoothness:
+        if not isinstance(agent, PPO):
+            raise BadInput(f"algorithm.smoothness={config.smoothness:g}", f"{config.target} is no PPO", "0")
+        agent.smooth(commands)
+    return agent
