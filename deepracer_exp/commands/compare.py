@@ -9,9 +9,8 @@ from deepracer_exp.runs.files import CONFIG, is_run
 from .arguments import STORES, Stores, add_command, add_run, read_stores, runs_and_overrides
 from .compare_logs import CHECKPOINT, against_log, compare_recordings
 from .compare_runs import compare_runs
-from .compared import Item
 from .output import check_file
-from .pages import add_page, add_replay, existing_logs, run_or_logs
+from .pages import Item, add_page, add_replay, existing_logs, run_or_logs
 
 _EPILOG = """\
   deepracer-exp compare RUN RUN                             how two runs differ, and what each achieved

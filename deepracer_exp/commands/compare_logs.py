@@ -9,9 +9,8 @@ from deepracer_exp.errors import writing
 from deepracer_exp.runs.files import TRACE
 
 from .arguments import Stores
-from .compared import Item, light, write_comparison_page
 from .output import print_table, table_console, warnings_on_stderr
-from .pages import end_with_page, page_name, write_laps
+from .pages import Item, end_with_page, light, page_name, write_comparison_page, write_laps
 
 if TYPE_CHECKING:
     from deepracer_exp.analysis.log_view import LogView

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.files import METRICS
 
-from .compared import Item, light, write_comparison_page
 from .output import print_table, table_console
-from .pages import end_with_page, write_laps
+from .pages import Item, end_with_page, light, write_comparison_page, write_laps
 
 if TYPE_CHECKING:
     from deepracer_exp.analysis.charts.figure import Chart

@@ -1,8 +1,9 @@
-"""Trackers that write through TorchRL's loggers: TensorBoard and Weights & Biases.
+"""The tracker of a run: by `tracking.kind`, here those that write through TorchRL's loggers, or a class of your own.
 
 Metrics have the same names as in MLflow.
 """
 
+import importlib.util
 import logging
 import re
 import shutil
@@ -13,11 +14,20 @@ from pathlib import Path
 
 from typing_extensions import override
 
-from deepracer_exp.config.running import WandbTracking
+from deepracer_exp.config.own_class import OwnClass, build_own
+from deepracer_exp.config.running import (
+    MLflowTracking,
+    TensorBoardTracking,
+    TrackingConfig,
+    TrackingOff,
+    WandbTracking,
+)
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.files import TENSORBOARD, WANDB
 
 from .metrics import recordable_values
+from .mlflow_tracker import MLflowTracker
+from .store import resolve_store
 from .tracker import FINISH_S, Tracker
 from .tracking_file import Status, TrackedRun
 
@@ -139,3 +149,23 @@ class WandbTracker(Tracker):
         if ending.is_alive():
             self.failure = "W&B does not answer; `wandb sync` in the run folder uploads what is missing"
             _log.warning(self.failure)
+
+
+def open_tracker(config: TrackingConfig, runs_dir: Path) -> Tracker:
+    """Return the tracker of a config.
+
+    Raises:
+        BadInput: `tracking.uri` can never work, a package is not installed, or a class cannot be used.
+    """
+    if isinstance(config, OwnClass):
+        return build_own(config, "tracking.target", Tracker)
+    if isinstance(config, TrackingOff):
+        return Tracker()
+    if isinstance(config, MLflowTracking):
+        return MLflowTracker(resolve_store(config.uri, runs_dir))
+    if importlib.util.find_spec(config.kind) is None:
+        raise BadInput(
+            f"tracking={config.kind}: needs the package {config.kind}; install the project with its extra: "
+            f"pip install 'deepracer-exp[{config.kind}]'"
+        )
+    return TensorBoardTracker() if isinstance(config, TensorBoardTracking) else WandbTracker(config)

@@ -43,7 +43,7 @@ from deepracer_exp.runs.lineage import Lineage, read_lineage
 from deepracer_exp.runs.result import FINISHED, INTERRUPTED, Ending
 from deepracer_exp.sim.batch import CarBatch
 from deepracer_exp.stopping.rules import UNDECIDED
-from deepracer_exp.tracking.build import open_tracker
+from deepracer_exp.tracking.loggers import open_tracker
 from deepracer_exp.tracking.metadata import joined, lineage_tags, run_params, run_tags
 from deepracer_exp.tracking.metrics import now_ms
 from deepracer_exp.tracking.tracking_file import TrackedRun, begin_again, read_tracked_run

@@ -7,7 +7,7 @@ import pytest
 
 from deepracer_exp.config.running import TensorBoardTracking, WandbTracking
 from deepracer_exp.runs.files import TENSORBOARD, WANDB
-from deepracer_exp.tracking.build import open_tracker
+from deepracer_exp.tracking.loggers import open_tracker
 from deepracer_exp.tracking.metrics import METRICS, metric_name
 from deepracer_exp.tracking.tracker import Tracker
 from deepracer_exp.tracking.tracking_file import TrackedRun

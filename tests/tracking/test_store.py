@@ -5,7 +5,7 @@ import pytest
 
 from deepracer_exp.config.running import MLflowTracking
 from deepracer_exp.errors import BadInput
-from deepracer_exp.tracking.build import open_tracker
+from deepracer_exp.tracking.loggers import open_tracker
 from deepracer_exp.tracking.store import resolve_store
 from tests.conftest import refused
 
@@ -38,7 +38,7 @@ def test_a_path_that_sqlite_uris_cannot_name_is_bad_input(tmp_path):
 
 def test_neither_a_uri_that_is_checked_nor_tracking_off_imports_mlflow(tmp_path):
     code = (
-        "import sys; from pathlib import Path; from deepracer_exp.tracking.build import *\n"
+        "import sys; from pathlib import Path; from deepracer_exp.tracking.loggers import *\n"
         "from deepracer_exp.tracking.tracking_file import TrackedRun\n"
         "from deepracer_exp.tracking.store import resolve_store\n"
         f"resolve_store(None, Path({str(tmp_path)!r}))\n"

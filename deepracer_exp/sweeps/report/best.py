@@ -1,17 +1,25 @@
-"""The best trial of a study: its values, the command that trains it, its run."""
+"""The best trial of a study: its values, the command that trains it, its run, and its lead over seeds."""
 
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
+from deepracer_exp.analysis.evidence import Interval, difference, estimate
+from deepracer_exp.analysis.statistics import Values
 from deepracer_exp.errors import BadInput
 from deepracer_exp.lookup.best import BestOfSweep, write_best_of_sweep
 from deepracer_exp.runs.files import is_run
-from deepracer_exp.sweeps.search.objectives import cost, objectives_of, shown_values
+from deepracer_exp.sweeps.search.objectives import MEASURES, NONE, cost, objectives_of, shown, shown_values
 from deepracer_exp.sweeps.trial import SeedRun, Trial
+
+from .labels import parameter
+
+_MOST_ROWS = 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,3 +123,47 @@ def write_best(study: optuna.Study, runs_dir: Path) -> Path:
     return write_best_of_sweep(
         folder, BestOfSweep(study=study.study_name, trial=trial, run_dir=run.name, values=values)
     )
+
+
+def over_seeds(study: optuna.Study, keys: dict[str, str]) -> list[dict[str, Any]]:
+    """Return the best trials with several seeds, by the first objective: each as texts, beside the best trial.
+
+    Args:
+        study: empty where its trials have one seed each.
+        keys: short names of the parameters.
+    """
+    objective = objectives_of(study)[0]
+    repeated = [(trial, values) for trial in complete_trials(study) if len(values := _values(trial)) > 1]
+    if not repeated:
+        return []
+    best = best_trial(study)
+    rows = []
+    for trial, values in repeated[:_MOST_ROWS]:
+        score = estimate([values])
+        row = {
+            "trial": trial.number,
+            "seeds": score.seeds,
+            "iqm": shown(objective, score.iqm),
+            "interval": _ends(objective, score.interval),
+            "difference": NONE,
+            "probability": NONE,
+            "verdict": "the best" if trial.number == best.number else NONE,
+            "parameters": ", ".join(f"{keys[key]} {parameter(value)}" for key, value in trial.params.items()),
+        }
+        if trial.number != best.number and len(_values(best)):
+            apart = difference([values], [_values(best)], MEASURES[objective].minimize)
+            row |= {
+                "difference": NONE if apart.iqm is None else shown(objective, apart.iqm),
+                "probability": f"{apart.probability:.0%}",
+                "verdict": apart.verdict(),
+            }
+        rows.append(row)
+    return rows
+
+
+def _values(trial: FrozenTrial) -> Values:
+    return np.array([run.values[0] for run in Trial.of(trial).runs if run.values], np.float64)
+
+
+def _ends(objective: str, interval: Interval | None) -> str:
+    return NONE if interval is None else " to ".join(shown(objective, end) for end in interval)
