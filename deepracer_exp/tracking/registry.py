@@ -269,11 +269,10 @@ def read_overview(uri: str | None, runs_dir: Path) -> StoreOverview:
     with open_client("MLflow", uri, runs_dir) as client:
         from mlflow.entities import ViewType
 
-        listed = pages(client.search_experiments, view_type=ViewType.ALL)
-        experiments = [each.experiment_id for each in listed]
+        experiments = pages(client.search_experiments, view_type=ViewType.ALL)
         runs = pages(
             client.search_runs,
-            experiment_ids=[each.experiment_id for each in experiments],
+            experiment_ids=[experiment.experiment_id for experiment in experiments],
             run_view_type=ViewType.ALL,
         )
         deleted = {run.info.run_id: run.info.lifecycle_stage != "active" for run in runs}

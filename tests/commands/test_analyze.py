@@ -165,7 +165,7 @@ def test_a_fault_of_the_page_is_reported_and_leaves_the_training_finished(train_
     def fault(*_):
         raise ZeroDivisionError("a bug\nof two lines")
 
-    monkeypatch.setattr(log_report, "write_page", fault)
+    monkeypatch.setattr(log_report, "write_log_page", fault)
     ended = train_here("report=true", "budget.iterations=1")
     assert ended.code == 0
     assert ended.summary["status"] == "finished"
@@ -182,7 +182,7 @@ def test_a_second_signal_during_the_page_leaves_it_off_and_the_training_finished
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(log_report, "write_page", interrupted)
+    monkeypatch.setattr(log_report, "write_log_page", interrupted)
     ended = train_here("report=true", "budget.iterations=1")
     assert (ended.code, ended.summary["status"]) == (0, "finished")
     assert "report.html was left off; `deepracer-exp analyze " in ended.stderr
