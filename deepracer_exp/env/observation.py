@@ -14,7 +14,7 @@ from .state import Measures
 OTHERS = ("gap", "side", "closing", "bot")
 """What is observed of each of the next others, see `RaceOthers.features`."""
 _NOBODY = np.array([1, 0, 0, 0], np.float32)
-"""The same where there is no other."""
+"""Values observed in place of an other that is not there."""
 
 
 class ObservationPart:

@@ -90,8 +90,8 @@ class RaceOthers:
         Raises:
             BadInput: it is of other numbers of cars, boxes or bots.
         """
-        own = self.state_dict()
-        checked = {name: checked_array(state, name, values.shape) for name, values in own.items()}
+        held = self.state_dict()
+        checked = {name: checked_array(state, name, values.shape) for name, values in held.items()}
         self.others.load_state_dict(checked)
         self._held_until = checked["held_until"]
 
@@ -177,8 +177,10 @@ class RaceOthers:
             box_m = others.distance_m[ids, nearest]
             before = rules.tracks.points_at((box_m - BEHIND_BOX_M) / length_m, track_index)
             lane = self._other_lane(track_index, others.offset_m[ids, nearest])
-            for part, found in zip((x, y, yaw_rad), self.lanes.poses(before, lane, track_index), strict=True):
-                part[in_box] = found[in_box]
+            for part, lane_values in zip(
+                (x, y, yaw_rad), self.lanes.poses(before, lane, track_index), strict=True
+            ):
+                part[in_box] = lane_values[in_box]
         for part, here in zip((x, y, yaw_rad), (now.x_m, now.y_m, now.yaw_rad), strict=True):
             part[stays] = here[ids][stays]
         return Pose(x, y, yaw_rad)
@@ -195,16 +197,16 @@ class RaceOthers:
         track_index = rules.track_index[ids]
         length_m = rules.tracks.length_m[track_index]
         out = np.zeros((len(ids), count, len(OTHERS)), np.float32)
-        found, gap_m = next_ones(others.distance_m[ids], now.ndist * length_m, length_m, count, BESIDE_M)
-        near = (found >= 0) & (gap_m < reach_m)
+        following, gap_m = next_ones(others.distance_m[ids], now.ndist * length_m, length_m, count, BESIDE_M)
+        near = (following >= 0) & (gap_m < reach_m)
         car = np.arange(len(ids))[:, None]
         speed_mps = others.speeds_mps(lap_clock_s(rules.steps, self._period_s))[ids]
-        side_m = others.offset_m[ids][car, found] - now.offset_m[:, None]
-        closing_mps = now.speed_mps[:, None] - speed_mps[car, found]
+        side_m = others.offset_m[ids][car, following] - now.offset_m[:, None]
+        closing_mps = now.speed_mps[:, None] - speed_mps[car, following]
         out[..., 0] = np.where(near, gap_m / reach_m, 1.0)
         out[..., 1] = np.where(near, np.clip(2 * side_m / now.track_width_m[:, None], -2, 2), 0.0)
         out[..., 2] = np.where(near, closing_mps / self._speed_scale_mps, 0.0)
-        out[..., 3] = near & others.is_bot[found]
+        out[..., 3] = near & others.is_bot[following]
         return out.reshape(len(ids), count * len(OTHERS))
 
     def boxes(self, ids: Ids) -> NDArray[np.float32]:
@@ -260,8 +262,10 @@ class RaceOthers:
             lane = self._other_lane(track_index[near], others.offset_m[ids[near], nearest[near]])
             points = np.stack([pose.x, pose.y], axis=-1)[near]
             pose = Pose(*(part.copy() for part in pose))
-            for part, found in zip(pose, self.lanes.poses(points, lane, track_index[near]), strict=True):
-                part[near] = found
+            for part, lane_values in zip(
+                pose, self.lanes.poses(points, lane, track_index[near]), strict=True
+            ):
+                part[near] = lane_values
         return pose
 
     def _other_lane(self, track_index: Ids, offset_m: Floats) -> NDArray[np.int64]:
@@ -279,8 +283,8 @@ class RaceOthers:
                 [x + self._front_m * np.cos(yaw_rad), y + self._front_m * np.sin(yaw_rad)], axis=-1
             )
             bot = 100 * rules.tracks.project(fronts, rules.track_index[ids]).ndist
-            own = np.mod(progress[ids] + 100 * rules.start_ndist[ids], 100)
-            behind[ids], ahead[ids] = own < bot, own > bot
+            own_percent = np.mod(progress[ids] + 100 * rules.start_ndist[ids], 100)
+            behind[ids], ahead[ids] = own_percent < bot, own_percent > bot
         return behind, ahead
 
     def _columns(self, now: Measures, time_s: Floats) -> dict[str, np.ndarray]:

@@ -127,8 +127,8 @@ class RaceProtocol:
             self._decide(car, EPISODE_STATUS[status[car]], progress[car], back)
         # The last progress on the track: beyond its border another section may be closer.
         self._progress = np.where(status == STATUS_CODE[_LAP], 0.0, progress)
-        for one in back:
-            self._progress[one.car] = one.percent
+        for placed in back:
+            self._progress[placed.car] = placed.percent
         columns = zip(*back, strict=True) if back else ((),) * len(_Back._fields)
         types = (np.intp, np.float64, np.bool_, np.bool_, np.float64)
         return PutBack(*(np.array(values, kind) for values, kind in zip(columns, types, strict=True)))

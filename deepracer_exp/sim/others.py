@@ -239,7 +239,7 @@ def first_hit(x_m, y_m, yaw_rad, poses, half_m):  # type: ignore[no-untyped-def]
         half_m: half the others' extents along and across, (K, 2).
     """
     cars, count = poses.shape[:2]
-    found = np.full(cars, -1)
+    hit = np.full(cars, -1)
     half_length, half_width = 0.5 * CAR_M[0], 0.5 * CAR_M[1]
     reach = math.hypot(half_length, half_width)
     for car in range(cars):
@@ -256,11 +256,11 @@ def first_hit(x_m, y_m, yaw_rad, poses, half_m):  # type: ignore[no-untyped-def]
                 px, py = dx + cos * along - sin * across, dy + sin * along + cos * across
                 ahead, left = turn_cos * px + turn_sin * py, turn_cos * py - turn_sin * px
                 if abs(ahead) < half_m[other, 0] and abs(left) < half_m[other, 1]:
-                    found[car] = other
+                    hit[car] = other
                     break
-            if found[car] >= 0:
+            if hit[car] >= 0:
                 break
-    return found
+    return hit
 
 
 @njit(cache=True, nogil=True)
@@ -274,23 +274,23 @@ def closest(distance_m, own_m):  # type: ignore[no-untyped-def]
         own_m: of the cars' front points, (N,).
     """
     cars, count = distance_m.shape
-    found = np.empty((cars, 2), np.int64)
+    nearest = np.empty((cars, 2), np.int64)
     for car in range(cars):
         behind = ahead = first = last = -1
         for other in range(count):
-            at = distance_m[car, other]
-            if at <= own_m[car]:
-                if behind < 0 or at > distance_m[car, behind]:
+            distance = distance_m[car, other]
+            if distance <= own_m[car]:
+                if behind < 0 or distance > distance_m[car, behind]:
                     behind = other
-            elif ahead < 0 or at < distance_m[car, ahead]:
+            elif ahead < 0 or distance < distance_m[car, ahead]:
                 ahead = other
-            if first < 0 or at < distance_m[car, first]:
+            if first < 0 or distance < distance_m[car, first]:
                 first = other
-            if last < 0 or at >= distance_m[car, last]:
+            if last < 0 or distance >= distance_m[car, last]:
                 last = other
-        found[car, 0] = behind if behind >= 0 else last
-        found[car, 1] = ahead if ahead >= 0 else first
-    return found
+        nearest[car, 0] = behind if behind >= 0 else last
+        nearest[car, 1] = ahead if ahead >= 0 else first
+    return nearest
 
 
 @njit(cache=True, nogil=True)
@@ -305,18 +305,21 @@ def next_ones(distance_m, own_m, length_m, count, behind_m):  # type: ignore[no-
         behind_m: an other counts as ahead until it is so far behind.
     """
     cars, others = distance_m.shape
-    found, gap_m = np.full((cars, count), -1), np.full((cars, count), np.inf)
+    following, gap_m = np.full((cars, count), -1), np.full((cars, count), np.inf)
     for car in range(cars):
         for other in range(others):
             gap = (distance_m[car, other] - own_m[car] + behind_m) % length_m[car] - behind_m
             place = count
             while place > 0 and gap < gap_m[car, place - 1]:
                 if place < count:
-                    found[car, place], gap_m[car, place] = found[car, place - 1], gap_m[car, place - 1]
+                    following[car, place], gap_m[car, place] = (
+                        following[car, place - 1],
+                        gap_m[car, place - 1],
+                    )
                 place -= 1
             if place < count:
-                found[car, place], gap_m[car, place] = other, gap
-    return found, gap_m
+                following[car, place], gap_m[car, place] = other, gap
+    return following, gap_m
 
 
 @njit(cache=True)

@@ -33,7 +33,7 @@ class Paths(NamedTuple):
     at: NDArray[np.int64]
     cells: NDArray[np.int64]
     length_m: Floats
-    """Of each course's centre line."""
+    """Length of each course's centre line, in metres."""
 
 
 class Lanes:

@@ -14,7 +14,9 @@ def noise():
 
 def test_actions_are_drawn_as_often_as_their_probabilities_say(noise):
     wanted = torch.tensor([0.5, 0.0, 0.3, 0.15, 0.05])
-    action = _drawn(Categorical(probs=wanted.expand(len(noise), -1)), noise[:, :1])
+    distribution = Categorical(probs=wanted.expand(len(noise), -1))
+    action, log_prob = _drawn(distribution, noise[:, :1])
+    assert torch.equal(log_prob, distribution.log_prob(action))
     found = torch.bincount(action, minlength=5) / len(noise)
     assert found[1] == 0
     assert (found - wanted).abs().max() < 0.005
@@ -22,7 +24,9 @@ def test_actions_are_drawn_as_often_as_their_probabilities_say(noise):
 
 def test_steering_and_speed_have_the_mean_and_deviation_of_the_policy(noise):
     loc, scale = torch.tensor([0.25, -1.0]), torch.tensor([0.5, 0.125])
-    action = _drawn(IndependentNormal(loc.expand(len(noise), 2), scale.expand(len(noise), 2)), noise)
+    distribution = IndependentNormal(loc.expand(len(noise), 2), scale.expand(len(noise), 2))
+    action, log_prob = _drawn(distribution, noise)
+    assert torch.equal(log_prob, distribution.log_prob(action))
     assert action.dtype == torch.float32
     assert (action.mean(0) - loc).abs().max() < 0.005
     assert (action.std(0) / scale - 1).abs().max() < 0.01
