@@ -32,11 +32,12 @@ def terms(params: dict) -> dict:
         gained = 0.0
     _last["progress"], _last["steps"] = params["progress"], params["steps"]
     danger = 0.0
-    if params["objects_distance"]:
+    beside = params.get("objects_distance_from_center")  # deepracer-on-aws validates without it
+    if beside:
         ahead = params["closest_objects"][1]
         gap = (params["objects_distance"][ahead] - params["projection_distance"]) % params["track_length"]
         own = signed(params["distance_from_center"], params["is_left_of_center"])
-        other = signed(params["objects_distance_from_center"][ahead], params["objects_left_of_center"][ahead])
+        other = signed(beside[ahead], params["objects_left_of_center"][ahead])
         danger = max(0.0, 1.0 - gap / DANGER_M) * max(0.0, 1.0 - abs(own - other) / CLEAR_M)
     return {
         "progress": PROGRESS_WEIGHT * gained / 100.0 * params["track_length"],
@@ -57,10 +58,10 @@ def reward_batch(params: dict) -> np.ndarray:
     """Apply the same formula to many cars."""
     gained = params["progress"] - params["previous_progress"]
     costs = STEP_COST + OFF_ROAD_COST * params["is_offtrack"] + CRASH_COST * params["is_crashed"]
-    if params["objects_distance"].shape[1]:
+    distances = params["objects_distance"]
+    if distances.shape[1]:
         car, ahead = np.arange(len(gained)), params["closest_objects"][:, 1]
-        gap = params["objects_distance"][car, ahead] - params["projection_distance"]
-        gap = gap % params["track_length"]
+        gap = (distances[car, ahead] - params["projection_distance"]) % params["track_length"]
         own = np.where(params["is_left_of_center"], 1.0, -1.0) * params["distance_from_center"]
         sides = np.where(params["objects_left_of_center"], 1.0, -1.0) * params["objects_distance_from_center"]
         beside = np.abs(own - sides[car, ahead])

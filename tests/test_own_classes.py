@@ -198,7 +198,7 @@ class SaysYes(StoppingRule):
         ("network=my_network:nn", "network.target=my_network:nn: is a module; accepted: a class"),
         ("network=my_rule:LapUnder", "accepted: a subclass of torch.nn.modules.module.Module"),
         ("lr_schedule=my_rule:LapUnder", "accepted: a subclass of deepracer_exp.agents.schedules.Schedule"),
-        ("algorithm=my_rule:LapUnder", "accepted: a subclass of deepracer_exp.agents.ppo.Algorithm"),
+        ("algorithm=my_rule:LapUnder", "accepted: a subclass of deepracer_exp.agents.algorithm.Algorithm"),
         (
             "observation=my_rule:LapUnder",
             "accepted: a subclass of deepracer_exp.env.observation.ObservationPart",

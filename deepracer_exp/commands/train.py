@@ -44,7 +44,7 @@ An experiment is one option of each group, and any value in it can be set:
                                                             what each group of seeds scored, and what is chance
   deepracer-exp train track=Oval_track --cfg                print the experiment and stop
 
-groups: track car action_space observation randomization episode reward network algorithm lr_schedule
+groups: track race car action_space observation randomization episode reward network algorithm lr_schedule
         collector evaluation checkpoints stopping budget tracking experiment
   deepracer-exp train --options GROUP                       list the options of a group
 """
