@@ -124,10 +124,10 @@ def _sentence(error: BaseException) -> str:
         return f"the server answers with error {status}"
     if isinstance(error, ParseError) or ("valid JSON" in text and not isinstance(error, RestException)):
         return "the answer is not that of an MLflow server"
-    return one_line(getattr(error, "orig", None) or error)
+    return redacted_line(getattr(error, "orig", None) or error)
 
 
-def one_line(error: BaseException) -> str:
+def redacted_line(error: BaseException) -> str:
     """Return an error of a database on one line, shortened and without passwords."""
     return redact(" ".join(str(error).split()))[:300]
 

@@ -27,7 +27,7 @@ from tenacity.wait import wait_exponential_jitter
 from deepracer_exp.addresses import with_password, without_passwords
 from deepracer_exp.errors import BadInput, RunFailed, nearest, reading
 from deepracer_exp.sweeps import DEFAULT_FILE
-from deepracer_exp.tracking.calls import one_line
+from deepracer_exp.tracking.calls import redacted_line
 from deepracer_exp.tracking.store import check_database_file
 
 Result = TypeVar("Result")
@@ -214,7 +214,7 @@ def _reason(error: BaseException) -> str:
     """Return the error in one line, without the statement and its values."""
     if isinstance(error, StorageInternalError) and error.__cause__ is not None:
         return _reason(error.__cause__)
-    return one_line(error.orig if isinstance(error, DBAPIError) and error.orig is not None else error)
+    return redacted_line(error.orig if isinstance(error, DBAPIError) and error.orig is not None else error)
 
 
 def _open(database: Database) -> RDBStorage:
@@ -264,4 +264,4 @@ def _rdb(database: Database, *, create: bool) -> RDBStorage:
     try:
         return RDBStorage(url, engine_kwargs=database.engine_options(), skip_table_creation=not create)
     except RuntimeError as error:
-        raise BadInput(database.shown, one_line(error)) from None
+        raise BadInput(database.shown, redacted_line(error)) from None
