@@ -33,7 +33,7 @@ laps (at most 1.3 m/s), and 10 degrees to either side at their median speed.
 """
 METADATA, PICTURE = "model_metadata.json", "actions.png"
 FREE = ["action_space=continuous", "action_space.speed.high=4"]
-"""What the fastest lap of a track may command: as `tracks NAME --fastest` is told in its help."""
+"""What the fastest lap of a track may command: in the words of `tracks NAME --fastest`."""
 
 
 class _Source(NamedTuple):

@@ -46,12 +46,12 @@ def compare_recordings(args: argparse.Namespace, items: Sequence[Item]) -> int:
         generalisation_matrix(list(map(policy_of, views))),
     ]
     table = Table(("recording", "driven"), tuple((view.name, headline(view)) for view in views), 2)
-    told = ["Logs know the laps of the training only, driven by a policy that explores."]
-    out = write_comparison_page(args.output, items, told, [("Recordings", table, "")], charts)
+    notes = ["Logs know the laps of the training only, driven by a policy that explores."]
+    out = write_comparison_page(args.output, items, notes, [("Recordings", table, "")], charts)
     if args.replay is not None:
         write_laps(args.replay, laps_of_log(whole[0], whole[1]))
     print_table(table_console(), "Recordings", table)
-    print(told[0])
+    print(notes[0])
     end_with_page(out, args.open)
     if args.replay is not None:
         print(f"  laps  {args.replay}")

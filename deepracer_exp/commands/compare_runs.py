@@ -131,15 +131,15 @@ def _show(
     if single:
         letters = dict(zip(ascii_uppercase, groups, strict=False))
         groups = [RunGroup(f"{letter}  {group.name}", group.records) for letter, group in letters.items()]
-        told = ["Each run is alone: nothing says how much of a difference is chance. Train more seeds."]
+        notes = ["Each run is alone: nothing says how much of a difference is chance. Train more seeds."]
     else:
         found = compared(groups)
-        told = sentences(groups, found)
+        notes = sentences(groups, found)
         tables.append(("Groups", scored(groups), _SCORED))
         if found:
             tables.append((f"Against {groups[0].name}", differences_table(found), _DIFFERENCES))
     if of_all > len(groups):
-        told.append(f"{of_all} groups: shown are the {len(groups)} with the best race score.")
+        notes.append(f"{of_all} groups: shown are the {len(groups)} with the best race score.")
     shown = [record for group in groups for record in group.records]
     tables += _run_tables(groups)
     charts = [
@@ -148,13 +148,13 @@ def _show(
         _generations(shown),
         generalisation_matrix([(one.name, course_of(one), stored_completion(one.path)) for one in shown]),
     ]
-    out = write_comparison_page(args.output, items, told, tables, charts)
+    out = write_comparison_page(args.output, items, notes, tables, charts)
     if args.format == "table":
         console = table_console()
         for title, table, _ in tables:
             if single or title != _RUNS:  # the page lists the runs of groups
                 print_table(console, title, table)
-        for sentence in told:
+        for sentence in notes:
             console.print(sentence, soft_wrap=not console.is_terminal)
         end_with_page(out, args.open)
 

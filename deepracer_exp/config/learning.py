@@ -143,7 +143,7 @@ OneAlgorithm = Annotated[
     Annotated[PPOConfig, Tag("ppo")] | Annotated[SACConfig, Tag("sac")],
     Discriminator(lambda value: "sac" if isinstance(value, dict) and "replay_steps" in value else "ppo"),
 ]
-"""One of the algorithms; their keys tell them apart."""
+"""Configuration of any algorithm, recognised by its keys."""
 
 
 @dataclass(frozen=True, kw_only=True)

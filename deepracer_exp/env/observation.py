@@ -13,7 +13,7 @@ from .state import Measures
 
 OTHERS = ("gap", "side", "closing", "bot")
 """What is observed of each of the next others, see `RaceOthers.features`."""
-_NOBODY = np.array([1, 0, 0, 0], np.float32)
+_ABSENT = np.array([1, 0, 0, 0], np.float32)
 """Values observed in place of an other that is not there."""
 
 
@@ -143,7 +143,7 @@ class Features:
             track_index: index of each car's track, (N,).
             steering_deg: last commanded steering (N,).
             commanded_mps: last commanded speed (N,).
-            others: what is observed of the next boxes and bots, (N, len(OTHERS) * next_objects); None: nobody is there.
+            others: what is observed of the next boxes and bots, (N, len(OTHERS) * next_objects); None: there are none.
         """
         config = self._config
         road = self._tracks.points_at(now.ndist[:, None] + self._ahead_ndist[track_index], track_index)
@@ -164,7 +164,7 @@ class Features:
         out[:, 8:end:2] = dy * cos - dx * sin
         if config.next_objects:
             begin, end = end, end + len(OTHERS) * config.next_objects
-            out[:, begin:end] = np.tile(_NOBODY, config.next_objects) if others is None else others
+            out[:, begin:end] = np.tile(_ABSENT, config.next_objects) if others is None else others
         for part in self._parts:
             begin, end = end, end + len(part.names)
             out[:, begin:end] = part.compute(now, steering_deg, commanded_mps)

@@ -101,7 +101,7 @@ class RaceOthers:
         Args:
             ids: indices of the cars, (n,).
             pose: where they would start, on the centre line, (n,) each.
-            evaluated: whether the start is that of an evaluation, where the service looks for nobody.
+            evaluated: whether the start is that of an evaluation, where the service ignores the others.
         """
         self._held_until[ids] = 0
         first = self._rules.episode[ids] <= 0

@@ -41,7 +41,7 @@ from deepracer_exp.runs.recording import RunRecording
 from .page import Glimpse, Plot, plot_of, render
 
 MOST_FILES = 400
-_BESIDE, _PAID = "Generations and tracks", "What the reward pays for"
+_BESIDE, _REWARDED = "Generations and tracks", "What the reward function rewards"
 _PICTURE = "lap_line"
 """The figure beside the outcome."""
 SECTIONS: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
@@ -64,11 +64,11 @@ SECTIONS: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
     "What it does": (
         *(actions.action_use_by_section, actions.zero_steering_top_speed, actions.entropy_along_track),
     ),
-    _PAID: (
+    _REWARDED: (
         *(rewards.reward_map, rewards.reward_by_waypoint, rewards.value_map, rewards.reward_distribution),
         *(rewards.common_rewards, rewards.scatter_time_reward, rewards.discount_factors),
     ),
-    "The course": (driving_line.waypoint_map,),
+    "The track": (driving_line.waypoint_map,),
 }
 """The figures of a training, in the order of the page; a new one is added here."""
 RACES: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
@@ -77,8 +77,8 @@ RACES: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
     "Lap times": (laps.lap_time_histogram, laps.lap_delta),
     "The line it drives": SECTIONS["The line it drives"][:5],
     "Where it goes wrong": (mistakes.episode_ends_map,),
-    _PAID: (),
-    "The course": (driving_line.waypoint_map,),
+    _REWARDED: (),
+    "The track": (driving_line.waypoint_map,),
 }
 """The figures of a recording without a training."""
 FIRST = (
@@ -135,7 +135,7 @@ def draw_sections(page: LogPage) -> dict[str, list[Chart]]:
     drawn |= {title: [draw_one(view) for draw_one in some] for title, some in sections.items()}
     drawn[_BESIDE] += [generations([view]), generalisation_matrix([policy_of(view)])]
     if page.terms is not None:
-        drawn[_PAID].append(rewards.reward_terms(view, page.terms))
+        drawn[_REWARDED].append(rewards.reward_terms(view, page.terms))
     drawable = {title: [chart for chart in some if chart is not None] for title, some in drawn.items()}
     return {title: some for title, some in drawable.items() if some}
 

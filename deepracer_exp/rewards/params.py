@@ -136,10 +136,10 @@ def batch_params(
         "waypoints": waypoints.copy(),
         "is_reversed": road.is_reversed,
     }
-    return params if MASK in params else {**params, **_nobody(len(selected["x"]))}
+    return params if MASK in params else {**params, **_no_others(len(selected["x"]))}
 
 
-def _nobody(n: int) -> dict[str, np.ndarray]:
+def _no_others(n: int) -> dict[str, np.ndarray]:
     """Return the columns about others for n cars that are alone."""
     return {
         "is_crashed": np.zeros(n, bool),

@@ -38,7 +38,7 @@ def plan_trial(overrides: Sequence[str], parent: Parent | None, *, stored: bool)
     """Plan the run of a trial: a training from scratch, or a clone of the study's parent.
 
     Arguments and errors as for `compose_experiment`, `plan_training` and `plan_clone`. Each worker is a process of its
-    own, and reads the files anew.
+    own, and reads the files again.
     """
     if parent is None:
         return plan_training(*compose_experiment(overrides, stored=stored))
