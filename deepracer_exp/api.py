@@ -14,6 +14,7 @@ from deepracer_exp.config.compose import Composition, compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.race_env import RaceEnv
+from deepracer_exp.env.rival import refuse_rivals
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.evaluation.evaluate import evaluate_run
 from deepracer_exp.evaluation.plan import plan_evaluation
@@ -62,7 +63,8 @@ def make_env(experiment: ComposedExperiment, n_cars: int = 1, threads: int = 1) 
     Raises:
         BadInput: a file of the experiment is missing or malformed, or the reward function cannot be used.
     """
-    return RaceEnv(Race(build_setup(experiment.config), n_cars, threads))
+    setup = refuse_rivals(build_setup(experiment.config), "an environment of its own")
+    return RaceEnv(Race(setup, n_cars, threads))
 
 
 def train(

@@ -1,4 +1,4 @@
-"""The race: alone, among boxes, among bots, or both (`conf/race/`); numbers decide, as on the service."""
+"""The race (`conf/race/`): alone, among boxes, bots or both, where numbers decide as on the service, or with a rival."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -69,6 +69,35 @@ class BotsConfig:
         return self.number
 
 
+NEWEST, POOL = "newest", "pool"
+"""Rivals that a run makes itself; any other `RivalsConfig.policy` names a run."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RivalsConfig:
+    """Another car beside every learner, driven by a policy that does not learn."""
+
+    policy: Annotated[str, Field(min_length=1)]
+    checkpoint: Annotated[str, Field(min_length=1)] | None
+    snapshot_every: Annotated[int, Field(ge=1, le=10**6)]
+    pool_size: Annotated[int, Field(ge=1, le=100)]
+    start_gap_m: Annotated[float, Field(ge=0.4, le=5, allow_inf_nan=False)]
+    pause_s: NonNegative
+
+    def __post_init__(self) -> None:
+        """Refuse a checkpoint of the learner's own snapshots."""
+        if self.is_own and self.checkpoint is not None:
+            raise ValueError(
+                f"checkpoint={self.checkpoint}: policy={self.policy} takes the learner's own snapshots; accepted: "
+                "checkpoint=null, or policy=RUN"
+            )
+
+    @property
+    def is_own(self) -> bool:
+        """Return whether the rivals are snapshots of the learner."""
+        return self.policy in (NEWEST, POOL)
+
+
 @dataclass(frozen=True, kw_only=True)
 class RaceConfig:
     """The others on the track."""
@@ -76,11 +105,20 @@ class RaceConfig:
     boxes: BoxesConfig
     bots: BotsConfig
     quirks: Literal["fixed", "service"]
+    rivals: RivalsConfig | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse boxes or bots beside a rival, which would have to meet the same ones."""
+        if self.rivals is not None and self.boxes.count + self.bots.count:
+            raise ValueError(
+                f"rivals: race without boxes and bots, and there are {self.boxes.count + self.bots.count}; accepted: "
+                "boxes.number=0 bots.number=0, or rivals=null"
+            )
 
     @property
     def others(self) -> int:
-        """Return how many boxes and bots there are."""
-        return self.boxes.count + self.bots.count
+        """Return how many boxes, bots and rivals there are around a car."""
+        return self.boxes.count + self.bots.count + (self.rivals is not None)
 
 
 ALONE = RaceConfig(

@@ -22,6 +22,7 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.sim.lidar import FURTHEST_M
 
 from .race import Race
+from .rival import refuse_rivals
 from .setup import RaceSetup, build_setup, deal
 from .top_view import TopView
 from .trace import EPISODE_STATUS, PACKED
@@ -29,6 +30,7 @@ from .trace import EPISODE_STATUS, PACKED
 Observed = Any
 """An array, or with two sensors a dictionary of arrays."""
 
+_KIND = "a Gymnasium environment"
 _METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 15}
 _BOUNDS = {"observation": (-np.inf, np.inf), "pixels": (0, 255), "lidar": (0, FURTHEST_M)}
 
@@ -55,7 +57,7 @@ class DeepRacerEnv(gym.Env[Observed, Any]):
             BadInput: an override or a file it names is not accepted, or there is no such mode.
         """
         self.render_mode = _checked(render_mode)
-        setup = build_setup(compose_experiment(overrides)[0])
+        setup = refuse_rivals(build_setup(compose_experiment(overrides)[0]), _KIND)
         self._race = Race(setup, 1)
         self._weights = [course.weight for course in setup.courses]
         self._courses = deal(self._weights)
@@ -121,7 +123,7 @@ class DeepRacerVectorEnv(VectorEnv[Observed, NDArray[Any], NDArray[Any]]):
             BadInput: an override or a file it names is not accepted, or there is no such mode.
         """
         self.render_mode = _checked(render_mode)
-        setup = setup or build_setup(compose_experiment(overrides)[0])
+        setup = refuse_rivals(setup or build_setup(compose_experiment(overrides)[0]), _KIND)
         if num_envs < len(setup.courses):
             raise BadInput(
                 f"num_envs={num_envs} with {len(setup.courses)} tracks: every track needs a car; accepted: at "

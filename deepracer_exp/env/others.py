@@ -171,7 +171,7 @@ class RaceOthers:
         stays = crashed & self._in_bot[ids]
         if boxes:
             at_m = np.mod(percent / 100 + rules.start_ndist[ids], 1.0) * length_m
-            away_m = _around(others.distance_m[ids, :boxes] - at_m[:, None], length_m[:, None])
+            away_m = around(others.distance_m[ids, :boxes] - at_m[:, None], length_m[:, None])
             nearest = np.abs(away_m).argmin(axis=1)
             in_box = ~stays & (np.abs(away_m[np.arange(len(ids)), nearest]) < NEAR_M)
             box_m = others.distance_m[ids, nearest]
@@ -254,7 +254,7 @@ class RaceOthers:
         length_m = rules.tracks.length_m[track_index, None]
         away_m = others.distance_m[ids] - rules.start_ndist[ids, None] * length_m
         # The service does not see across the start line.
-        away_m = _around(away_m, length_m) if self._race.quirks == "fixed" else away_m
+        away_m = around(away_m, length_m) if self._race.quirks == "fixed" else away_m
         nearest = np.abs(away_m).argmin(axis=1)
         row = np.arange(len(ids))
         near = np.flatnonzero(checked & (np.abs(away_m[row, nearest]) < NEAR_M))
@@ -284,8 +284,13 @@ class RaceOthers:
             )
             bot = 100 * rules.tracks.project(fronts, rules.track_index[ids]).ndist
             own_percent = np.mod(progress[ids] + 100 * rules.start_ndist[ids], 100)
-            behind[ids], ahead[ids] = own_percent < bot, own_percent > bot
+            ahead_percent = self._ahead_percent(own_percent, bot)
+            behind[ids], ahead[ids] = ahead_percent < 0, ahead_percent > 0
         return behind, ahead
+
+    def _ahead_percent(self, own_percent: Floats, percent: Floats) -> Floats:
+        """Return by how much of the lap cars are ahead of others, both counted from waypoint 0, (n,)."""
+        return own_percent - percent
 
     def _columns(self, now: Measures, time_s: Floats) -> dict[str, np.ndarray]:
         """Return the params about others, one row per car; `is_crashed` is not known yet."""
@@ -370,6 +375,6 @@ def _placed(
     return places_m, stream.integers(2, size=count)
 
 
-def _around(away_m: Floats, length_m: Floats) -> Floats:
+def around(away_m: Floats, length_m: Floats) -> Floats:
     """Return distances along a lap the shorter way round."""
     return np.mod(away_m + 0.5 * length_m, length_m) - 0.5 * length_m

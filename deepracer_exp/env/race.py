@@ -21,6 +21,7 @@ from .picture_randomization import PictureRandomization
 from .pictures import Pictures
 from .randomization import Randomization
 from .real_car import Servos
+from .rival import RaceRival
 from .rules import RaceRules, StepResult
 from .setup import RaceSetup
 from .state import Measures, checked_array
@@ -90,7 +91,10 @@ class Race:
         self._floors = np.array([course.tracks[0].floor.friction for course in setup.courses])
         self._batch = CarBatch(setup.car, n_cars, threads, self._floors[self.rules.course])
         self._reward_function = RewardFunction(setup.reward, n_cars, setup.reward_time_limit_s, prints)
-        self.others = None if setup.others is None else RaceOthers(setup.others, setup, self.rules)
+        self.others: RaceOthers | None = None
+        if setup.others is not None:
+            kind = RaceOthers if setup.others.rivals is None else RaceRival
+            self.others = kind(setup.others, setup, self.rules)
         low, high = setup.actions.low, setup.actions.high
         # A space that only drives straight ahead has no largest angle to divide by.
         steering_max_deg = max(abs(low[0]), abs(high[0])) or 1.0
@@ -182,6 +186,11 @@ class Race:
             start_ndist: where they start, as shares of the lap, (n,); None: as `episode` configures.
         """
         ids = self._everyone if ids is None else ids
+        self._start(ids, course, start_ndist)
+        self._observe_started(ids)
+
+    def _start(self, ids: np.ndarray, course: np.ndarray | None, start_ndist: np.ndarray | None) -> None:
+        """Put the cars `ids` where their new episodes begin; arguments as for `reset`."""
         pose = self.rules.reset(ids, start_ndist, course)
         if course is not None:
             self._batch.set_floor_friction(ids, self._floors[course])
@@ -193,7 +202,6 @@ class Race:
             self._servos.center(ids)
         self._begin(ids)
         self._batch.place(ids, pose.x, pose.y, pose.yaw_rad)
-        self._observe_started(ids)
 
     def _begin(self, ids: np.ndarray) -> None:
         """Draw what differs from episode to episode."""
@@ -268,6 +276,11 @@ class Race:
             RewardFailed: the reward function raised, timed out or returned no usable number.
             NonFinite: an action, a car's state or an observation is NaN or infinite.
         """
+        self._act(action)
+        self._look(action)
+
+    def _act(self, action: np.ndarray) -> None:
+        """Apply the rules, compute the rewards and move the cars; arguments and errors as for `step`."""
         steering_deg, speed_mps = self.setup.actions.commands(action)
         result = self.rules.apply()
         objects: dict[str, np.ndarray] = {}
@@ -287,6 +300,9 @@ class Race:
             self._drive(steering_deg, speed_mps, result.running)
         except RunFailed as error:
             raise self._lost_car(error, action) from error
+
+    def _look(self, action: np.ndarray) -> None:
+        """Observe where the cars have come to by an action; errors as for `step`."""
         self._observe()
         self._require_finite("observation", self.observation, self.feature_names, action)
 

@@ -38,6 +38,7 @@ class Purpose(IntEnum):
     LENS = 5
     POLICY = 6
     OTHERS = 7
+    RIVALS = 8
 
 
 class CarStreams:

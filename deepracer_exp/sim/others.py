@@ -40,7 +40,7 @@ class Others:
     """The K others of each of N cars, boxes first; every car has its own.
 
     Attributes:
-        is_bot: which of the others are bots, (K,), bool.
+        is_bot: which of the others are cars: bots, or a rival, (K,), bool.
         poses: x and y of the origins in metres and yaw in radians, (N, K, 3).
         distance_m: projections on the centre line, from waypoint 0, (N, K).
         offset_m: offsets to the left of the centre line, (N, K).
@@ -58,14 +58,14 @@ class Others:
             n_cars: number of cars.
         """
         self._race, self._lanes, self._tracks = race, lanes, tracks
-        boxes, bots = race.boxes.count, race.bots.count
+        boxes, bots, count = race.boxes.count, race.bots.count, race.others
         self._boxes = boxes
-        self.is_bot = np.arange(boxes + bots) >= boxes
+        self.is_bot = np.arange(count) >= boxes
         self.half_m = 0.5 * np.where(self.is_bot[:, None], CAR_M, BOX_M)
         self._paths: Paths | None = lanes.paths() if bots else None
-        self.poses = np.zeros((n_cars, boxes + bots, 3))
-        self.distance_m = np.zeros((n_cars, boxes + bots))
-        self.offset_m = np.zeros((n_cars, boxes + bots))
+        self.poses = np.zeros((n_cars, count, 3))
+        self.distance_m = np.zeros((n_cars, count))
+        self.offset_m = np.zeros((n_cars, count))
         self.start_m = np.zeros((n_cars, bots))
         self.lane = np.zeros((n_cars, bots), np.int64)
         self.changes = np.zeros((n_cars, bots), np.int64)
@@ -211,6 +211,12 @@ def check_room(race: RaceConfig, tracks: Sequence[tuple[str, Track]]) -> None:
                 f"race.bots.number={race.bots.count}",
                 f"the open track {name} has no lap for bots to drive round",
                 0,
+            )
+        if race.rivals is not None and not track.closed:
+            raise BadInput(
+                f"race.rivals.policy={race.rivals.policy}",
+                f"the open track {name} has no room behind its start for a second car",
+                "a closed track, or race.rivals=null",
             )
     for key, config in (("boxes", race.boxes), ("bots", race.bots)):
         if isinstance(config, BoxesConfig) and (config.placement == "fixed" or race.quirks == "service"):

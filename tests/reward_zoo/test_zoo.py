@@ -101,7 +101,7 @@ def among_others(columns: dict[str, np.ndarray], length_m: float) -> dict[str, n
     own = columns["distance_from_center"] * np.where(columns["is_left_of_center"], 1, -1)
     offset = random.uniform(-0.4, 0.4, (n, 3))
     offset[:, 1] = own + random.uniform(-0.5, 0.5, n)
-    gap_m = np.column_stack([-random.random(n), 2 * random.random(n), 2.5 + random.random(n)])
+    gap_m = np.column_stack([-3 * random.random(n), 2 * random.random(n), 2.5 + random.random(n)])
     return {
         **columns,
         "is_crashed": random.random(n) < 0.2,
@@ -303,6 +303,43 @@ def test_progress_delta_adds_up_to_the_lap_less_the_time(scalar: bool) -> None:
             total += float(reward(columns, roads, None)[0])
         driven_m = (progress[-1] - progress[0]) / 100 * roads[0].track_length
         assert total == pytest.approx(driven_m - 0.045 * len(progress))
+
+
+def beside_another(
+    name: str, gap_m: float, *, off: float = 0.2, other_off: float = 0.2, **given: Any
+) -> float:
+    """Return what one car gets for a step of 0.1 m with an other at a gap along the lap, which drives 0.75 m/s."""
+    columns, roads = drive("oval", np.array([10]), np.array([off]), np.zeros(1), **given)
+    length_m = roads[0].track_length
+    objects = among_others(columns, length_m)
+    objects["previous_progress"] = columns["progress"] - 100 * 0.1 / length_m
+    for key, value in {
+        "objects_distance": (columns["projection_distance"][:, None] + gap_m) % length_m,
+        "objects_left_of_center": np.array([[other_off > 0]]),
+        "objects_distance_from_center": np.array([[abs(other_off)]]),
+        "objects_speed": np.array([[0.75]]),
+        "objects_heading": np.zeros((1, 1)),
+        "objects_location": np.zeros((1, 1, 2)),
+        "objects_mask": np.ones((1, 1), bool),
+        "closest_objects": np.zeros((1, 2), np.int64),
+        "is_crashed": np.zeros(1, bool),
+    }.items():
+        objects[key] = value
+    return float(zoo(name, 1)(objects, roads, None)[0])
+
+
+def test_overtake_pays_for_what_is_gained_on_a_near_car_ahead_or_behind() -> None:
+    alone = beside_another("overtake", 8.0)
+    # 0.1 m made, 0.05 m by the other.
+    for gap_m in (2.0, 0.0, -2.0):
+        assert beside_another("overtake", gap_m) - alone == pytest.approx(0.5 * 0.05)
+
+
+def test_free_lane_costs_behind_a_near_object_on_the_own_side_only() -> None:
+    alone = beside_another("free_lane", 8.0)
+    assert beside_another("free_lane", 0.5) < beside_another("free_lane", 1.0) < alone
+    assert beside_another("free_lane", 0.5, other_off=-0.2) == alone
+    assert beside_another("free_lane", -0.5) == alone
 
 
 def test_look_ahead_pays_most_for_the_arc_of_the_road() -> None:

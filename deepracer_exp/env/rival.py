@@ -1,0 +1,139 @@
+"""The other car of a race head to head, as each of the two cars meets it."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepracer_exp.config.race import RaceConfig
+from deepracer_exp.errors import BadInput
+from deepracer_exp.sim.batch import CarState
+from deepracer_exp.sim.others import Others
+from deepracer_exp.tracks.lanes import INNER, OUTER
+from deepracer_exp.tracks.track import Pose
+
+from .others import RaceOthers, around
+from .rules import Bools, Ids, RaceRules
+from .setup import RaceSetup
+from .state import Floats
+
+_KEPT = ("speed_mps", "untouchable")
+
+
+class _OtherCar(Others):
+    """The one other of each of N cars, which is driven elsewhere and shown here.
+
+    Attributes:
+        speed_mps: how fast it drives, (N,).
+        untouchable: whether it serves a penalty, so that nobody can run into it, (N,), bool.
+    """
+
+    speed_mps: Floats
+    untouchable: NDArray[np.bool_]
+
+    def pause(self, hit: NDArray[np.bool_], time_s: Floats) -> None:
+        """Do nothing: a car that was run into drives on."""
+
+    def hit(self, x_m: Floats, y_m: Floats, yaw_rad: Floats) -> NDArray[np.int64]:
+        """Return 0 for cars that have run into the other and -1 for all else, as `Others.hit` does."""
+        return np.where(self.untouchable, -1, super().hit(x_m, y_m, yaw_rad))
+
+    def speeds_mps(self, time_s: Floats) -> Floats:
+        """Return how fast the other drives, (N, 1)."""
+        return self.speed_mps[:, None]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return copies of all arrays."""
+        return {**super().state_dict(), **{name: getattr(self, name).copy() for name in _KEPT}}
+
+    def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Restore a `state_dict`."""
+        super().load_state_dict(state)
+        for name in _KEPT:
+            getattr(self, name)[:] = state[name]
+
+
+class RaceRival(RaceOthers):
+    """The other car of each of N cars, under the service's rules for two models (deepracer-simapp).
+
+    There is no contact. Who runs into the other from behind is at fault; the other drives on.
+
+    Attributes:
+        is_rival: whether these cars are the rivals, whose other is the learner.
+    """
+
+    def __init__(self, race: RaceConfig, setup: RaceSetup, rules: RaceRules):
+        """Set up; arguments as for `RaceOthers`."""
+        super().__init__(race, setup, rules)
+        assert race.rivals is not None
+        self._start_gap_m = race.rivals.start_gap_m
+        self.is_rival = False
+        car = _OtherCar(race, self.lanes, rules.tracks, rules.n_cars)
+        car.speed_mps, car.untouchable = np.zeros(rules.n_cars), np.zeros(rules.n_cars, bool)
+        self.others = self._car = car
+
+    @property
+    def serving(self) -> Bools:
+        """Return which cars will be held at the next control step, (N,)."""
+        return np.asarray(self._held_until > self._rules.steps)
+
+    def begin(self, ids: Ids, pose: Pose, evaluated: bool) -> Pose:
+        """Return where the cars start: one at its place in the outer lane, the other behind it in the inner one.
+
+        The finish line of both is the place of the car in front. Who starts there is drawn, and in an evaluation
+        alternates from trial to trial.
+        """
+        self._held_until[ids] = 0
+        rules = self._rules
+        if evaluated:
+            leads = rules.cars[ids] % 2 == 0
+        else:
+            streams, episodes = self._streams, rules.episode
+            draws = [int(streams.stream(car, int(episodes[car])).integers(2)) for car in ids.tolist()]
+            leads = np.array(draws, np.int64) == 0
+        leads = leads != self.is_rival
+        track_index = rules.track_index[ids]
+        back = np.where(leads, 0.0, self._start_gap_m / rules.tracks.length_m[track_index])
+        points = rules.tracks.points_at(rules.start_ndist[ids] - back, track_index)
+        return self.lanes.poses(points, np.where(leads, OUTER, INNER), track_index)
+
+    def show(self, ids: Ids, cars: CarState, serving: Bools) -> None:
+        """Show the cars `ids` where their others are.
+
+        Args:
+            ids: indices of the cars, (n,).
+            cars: all others, (N,) each.
+            serving: which of these serve a penalty, (N,).
+        """
+        rules, car = self._rules, self._car
+        points = np.stack([cars.x_m[ids], cars.y_m[ids]], axis=-1)
+        projection = rules.tracks.project(points, rules.track_index[ids])
+        car.poses[ids, 0, :2], car.poses[ids, 0, 2] = points, cars.yaw_rad[ids]
+        car.distance_m[ids, 0], car.offset_m[ids, 0] = projection.distance_m, projection.offset_m
+        car.speed_mps[ids], car.untouchable[ids] = cars.speed_mps[ids], serving[ids]
+
+    def _ahead_percent(self, own_percent: Floats, percent: Floats) -> Floats:
+        # On the service the car that starts behind the line counts as ahead until it has crossed it.
+        if self._race.quirks == "service":
+            return super()._ahead_percent(own_percent, percent)
+        return around(own_percent - percent, np.full(len(percent), 100.0))
+
+
+def refuse_rivals(setup: RaceSetup, what: str) -> RaceSetup:
+    """Return a setup whose cars have no rival.
+
+    Args:
+        setup: of any race.
+        what: which kind of environment cannot have one.
+
+    Raises:
+        BadInput: they have.
+    """
+    if setup.others is not None and setup.others.rivals is not None:
+        raise BadInput(
+            f"race.rivals.policy={setup.others.rivals.policy}",
+            f"{what} has nobody who drives the rival",
+            "another race, or deepracer-exp train",
+        )
+    return setup
