@@ -65,7 +65,8 @@ def reward_batch(params: dict) -> np.ndarray:
     distances = params["objects_distance"]
     if distances.shape[1]:
         car, two = np.arange(len(made)), params["closest_objects"]
-        gaps = around(distances[car[:, None], two] - params["projection_distance"][:, None], length)
+        gaps = distances[car[:, None], two] - params["projection_distance"][:, None]
+        gaps = (gaps + 0.5 * length) % length - 0.5 * length
         nearest = np.abs(gaps).argmin(axis=1)
         relative = made - STEP_S * params["objects_speed"][car, two[car, nearest]]
         costs = costs - GAIN_WEIGHT * np.where(np.abs(gaps[car, nearest]) < REACH_M, relative, 0.0)

@@ -2,7 +2,7 @@
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Self
 
 import torch
@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 
 from deepracer_exp.config.learning import AlgorithmConfig
 from deepracer_exp.config.running import CollectorConfig
+from deepracer_exp.env.head_to_head import Weights
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.sim.batch import cores
 
@@ -58,6 +59,10 @@ class Collector(ABC):
     @abstractmethod
     def publish_policy(self) -> None:
         """Drive the next batches with the policy's present weights; raises as `next_batch`."""
+
+    @abstractmethod
+    def publish_rivals(self, weights: Sequence[Weights]) -> None:
+        """Let policies with these weights drive the rivals from the next batch on; raises as `next_batch`."""
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:

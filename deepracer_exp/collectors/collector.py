@@ -19,6 +19,7 @@ from torchrl.weight_update import SharedMemWeightSyncScheme
 
 from deepracer_exp.config.learning import AlgorithmConfig
 from deepracer_exp.config.running import CollectorConfig
+from deepracer_exp.env.head_to_head import Rivals, Weights
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.runs.crash_dump import read_crash_dump
@@ -46,6 +47,7 @@ class LocalCollector(Collector):
         frames_per_batch: int,
         run_dir: Path,
         state: Mapping[str, Any] | None = None,
+        rivals: Rivals | None = None,
     ):
         """Start the cars; arguments and errors as for `open_collector`.
 
@@ -61,7 +63,7 @@ class LocalCollector(Collector):
         self._watchdog: Watchdog | None = None
         cars = cars_per_process(config)
         steps_per_batch = -(-frames_per_batch // config.cars)
-        factory = functools.partial(EnvFactory, setup=setup, n_cars=cars, run_dir=run_dir)
+        factory = functools.partial(EnvFactory, setup=setup, n_cars=cars, run_dir=run_dir, rivals=rivals)
         options: dict[str, Any] = {
             "frames_per_batch": steps_per_batch * config.cars,
             "total_frames": -1,
@@ -103,6 +105,16 @@ class LocalCollector(Collector):
             self._collector.update_policy_weights_()
             return
         self._ask(self._publish, lambda: f"collector worker {self._receiver} took no new weights")
+
+    def publish_rivals(self, weights: Sequence[Weights]) -> None:
+        """Pass the rivals' weights to the workers."""
+        if self._watchdog is None:
+            self._collector.env.put_rivals(weights)
+            return
+        self._ask(
+            lambda: self._collector.map_fn("env.put_rivals", [(weights,)] * self._workers),
+            lambda: "a collector worker took no new rivals",
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the cars after the last batch."""
@@ -292,6 +304,7 @@ def open_collector(
     policy: torch.nn.Module,
     run_dir: Path,
     state: Mapping[str, Any] | None = None,
+    rivals: Rivals | None = None,
 ) -> Collector:
     """Start the cars where the configuration wants them.
 
@@ -303,6 +316,7 @@ def open_collector(
         run_dir: where workers leave crash dumps and prints.
         state: `state_dict` of a collector of the same configuration and setup: with the same weights, the next batch
             is what that one would have returned next, bit for bit. None or empty: new episodes begin.
+        rivals: who the cars race against; None: nobody.
 
     Raises:
         BadInput: the state is of other cars, or of another number of processes.
@@ -312,8 +326,8 @@ def open_collector(
     if config.mode == "ray":
         from .ray_collector import RayCollector
 
-        return RayCollector(config, setup, policy, frames, run_dir, state)
-    return LocalCollector(config, setup, policy, frames, run_dir, state)
+        return RayCollector(config, setup, policy, frames, run_dir, state, rivals)
+    return LocalCollector(config, setup, policy, frames, run_dir, state, rivals)
 
 
 def frames_per_batch(config: CollectorConfig, algorithm: AlgorithmConfig) -> int:

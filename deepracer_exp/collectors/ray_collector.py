@@ -14,6 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector as TorchRLCollector
 
 from deepracer_exp.config.running import CollectorConfig
+from deepracer_exp.env.head_to_head import Rivals, Weights
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.rewards.prints import RewardPrints
@@ -121,6 +122,10 @@ class Cars:
         self._policy.load_state_dict({name: torch.from_numpy(w.copy()) for name, w in weights.items()})
         self._collector.update_policy_weights_()
 
+    def put_rivals(self, weights: Sequence[Weights]) -> None:
+        """Let policies with these weights drive the rivals."""
+        self._collector.env.put_rivals(weights)
+
     def take_state(self) -> dict[str, Any]:
         """Return everything that the next batch depends on except the policy."""
         state: dict[str, Any] = self._collector.env.take_state()
@@ -148,6 +153,7 @@ class RayCollector(Collector):
         frames_per_batch: int,
         run_dir: Path,
         state: Mapping[str, Any] | None = None,
+        rivals: Rivals | None = None,
     ):
         """Start the cars; arguments and errors as for `open_collector`."""
         import ray
@@ -166,19 +172,26 @@ class RayCollector(Collector):
         self._cars = [kind.remote() for _ in range(config.processes)]
         self._where = ["Ray cluster"] * config.processes
         try:
-            self._start(config, setup, frames_per_batch, states)
+            self._start(config, setup, frames_per_batch, states, rivals)
         except BaseException:
             self.close()
             raise
 
     def _start(
-        self, config: CollectorConfig, setup: RaceSetup, frames_per_batch: int, states: Sequence[Any]
+        self,
+        config: CollectorConfig,
+        setup: RaceSetup,
+        frames_per_batch: int,
+        states: Sequence[Any],
+        rivals: Rivals | None,
     ) -> None:
         cars = cars_per_process(config)
         frames = -(-frames_per_batch // config.cars) * cars
         threads = config.threads or 1
         factories = [
-            EnvFactory(setup=setup, worker=worker, n_cars=cars, threads=threads, run_dir=self._run_dir)
+            EnvFactory(
+                setup=setup, worker=worker, n_cars=cars, threads=threads, run_dir=self._run_dir, rivals=rivals
+            )
             for worker in range(len(self._cars))
         ]
         policy = self._ray.put(self._policy)
@@ -200,6 +213,11 @@ class RayCollector(Collector):
         # Once for each node, not for each worker.
         weights = self._ray.put({name: w.detach().numpy() for name, w in self._policy.state_dict().items()})
         self._ask(lambda worker: self._cars[worker].take_weights.remote(weights))
+
+    def publish_rivals(self, weights: Sequence[Weights]) -> None:
+        """Send the workers the rivals' weights."""
+        sent = self._ray.put(list(weights))
+        self._ask(lambda worker: self._cars[worker].put_rivals.remote(sent))
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the cars after the last batch."""

@@ -3,7 +3,7 @@
 import os
 import signal
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import Unbounded
 
+from deepracer_exp.env.head_to_head import HeadToHead, Rivals, Weights
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.race_env import RaceEnv
 from deepracer_exp.env.randomization import CarStreams, Purpose, StepNoise
@@ -39,6 +40,8 @@ class EnvFactory:
     n_cars: int
     threads: int
     run_dir: Path
+    rivals: Rivals | None = None
+    """Who the cars race against; None: nobody."""
     heartbeat: Path | None = None
     """File of the counted steps; None if the environment does not live in a worker process of this machine."""
     prints: RewardPrints | None = None
@@ -53,15 +56,9 @@ class EnvFactory:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
             signal.signal(signal.SIGTERM, signal.SIG_IGN)
             end_with_owner()
-        race = Race(
-            self.setup,
-            self.n_cars,
-            threads=self.threads,
-            first_car=self.worker * self.n_cars,
-            prints=self.prints or RewardPrints(self.run_dir / REWARD_PRINTS),
-        )
+        race = self._race()
         if self.heartbeat is None:
-            return _StateKeepingEnv(race, self.on_step)
+            return _StateKeepingEnv(race, self.rivals, self.on_step)
         beats, worker = np.memmap(self.heartbeat, np.int64, "r+"), self.worker
         beats[worker] = 0
 
@@ -74,7 +71,19 @@ class EnvFactory:
             # No traceback from here: the training process finds the dump, prints its line and sets the exit code.
             os._exit(RunFailed.exit_code)
 
-        return _StateKeepingEnv(race, beat, end)
+        return _StateKeepingEnv(race, self.rivals, beat, end)
+
+    def _race(self) -> Race:
+        options: dict[str, Any] = {
+            "threads": self.threads,
+            "first_car": self.worker * self.n_cars,
+            "prints": self.prints or RewardPrints(self.run_dir / REWARD_PRINTS),
+        }
+        if self.rivals is None:
+            return Race(self.setup, self.n_cars, **options)
+        race = HeadToHead(self.setup, self.n_cars, self.rivals.setup, **options)
+        race.drive_with(self.rivals.policies(self.rivals.weights))
+        return race
 
 
 class _StateKeepingEnv(RaceEnv):
@@ -83,10 +92,12 @@ class _StateKeepingEnv(RaceEnv):
     def __init__(
         self,
         race: Race,
+        rivals: Rivals | None,
         on_step: Callable[[], None] | None,
         on_failure: Callable[[RunFailed], None] = lambda error: None,
     ):
         super().__init__(race, on_step)
+        self._rivals = rivals
         self._on_failure = on_failure
         width = 2 if race.setup.actions.n is None else 1
         streams = CarStreams(race.setup.seed, race.cars.tolist(), Purpose.POLICY)
@@ -103,6 +114,12 @@ class _StateKeepingEnv(RaceEnv):
         self.resume_from(state["race"])
         self._noise.steps = state["drawn"] - 1
         self._draw()
+
+    def put_rivals(self, weights: Sequence[Weights]) -> None:
+        """Let policies with these weights drive the rivals."""
+        assert isinstance(self.race, HeadToHead)
+        assert self._rivals is not None
+        self.race.drive_with(self._rivals.policies(weights))
 
     def _draw(self) -> None:
         # A copy: the next block of numbers is written over this one.

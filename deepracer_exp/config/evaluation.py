@@ -88,6 +88,15 @@ class EvaluateConfig:
 
     evaluation: EvaluationConfig
     checkpoint: Annotated[str, Field(min_length=1)] | None
+    rival: Annotated[str, Field(min_length=1)] | None
+    rival_checkpoint: Annotated[str, Field(min_length=1)] | None
     runs_dir: Annotated[str, Field(min_length=1)]
     tracking: StoreConfig
     debug: bool
+
+    def __post_init__(self) -> None:
+        """Refuse a checkpoint of no rival."""
+        if self.rival_checkpoint is not None and self.rival is None:
+            raise ValueError(
+                f"rival_checkpoint={self.rival_checkpoint}: of which run? accepted: with rival=RUN, or null"
+            )

@@ -1,4 +1,4 @@
-"""The race (`conf/race/`): alone, among boxes, bots or both, where numbers decide as on the service, or with a rival."""
+"""The race (`conf/race/`): alone, among boxes, bots or both, as numbers decide on the service, or with a rival."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal

@@ -23,8 +23,8 @@ from .setup import RaceSetup
 from .state import checked_array
 from .trace import PACKED, STATUS_CODE
 
-Weights = Mapping[str, torch.Tensor]
-"""The tensors of a policy by name."""
+Weights = Mapping[str, np.ndarray]
+"""The tensors of a policy by name, as arrays, which processes and checkpoints pass on without a pickle of PyTorch's."""
 
 _STATUS, _PROGRESS = PACKED["episode_status"], PACKED["progress"]
 _LAP, _PAUSE, _CRASHED, _GOING = (
@@ -48,6 +48,11 @@ def rival_setup(setup: RaceSetup, observation: ObservationConfig) -> RaceSetup:
     )
 
 
+def weights_of(policy: torch.nn.Module) -> Weights:
+    """Return copies of a policy's weights."""
+    return {name: tensor.detach().cpu().numpy().copy() for name, tensor in policy.state_dict().items()}
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Rivals:
     """Everything that rivals need in another process; picklable."""
@@ -64,7 +69,9 @@ class Rivals:
         policies = []
         for tensors in weights:
             policy = copy.deepcopy(self.policy)
-            policy.load_state_dict(dict(tensors))
+            policy.load_state_dict(
+                {name: torch.from_numpy(values.copy()) for name, values in tensors.items()}
+            )
             policies.append(policy.requires_grad_(False))
         return policies
 

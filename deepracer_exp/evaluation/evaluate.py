@@ -16,6 +16,7 @@ from deepracer_exp.config.evaluation import EvaluationConfig, RealCarConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.running import MLflowTracking
 from deepracer_exp.env.action_space import build_action_space, metadata_of
+from deepracer_exp.env.head_to_head import HeadToHead
 from deepracer_exp.errors import RunFailed, count, writing
 from deepracer_exp.files import atomic_write
 from deepracer_exp.runs.checkpoints import StoredPolicy
@@ -54,6 +55,7 @@ def results_table(
     penalties = any(vars(config.penalty_s).values())
     hidden = (() if config.resets_per_lap else ("resets",)) + (() if penalties else ("penalty s",))
     hidden += () if evaluation.among_others else ("crash-free %", "crashes")
+    hidden += () if any(group.won for group in evaluation.groups) else ("won %",)
 
     def lay_out(intervals: bool, left_out: Sequence[str]) -> Table:
         rows = [(label, condition, _cells(numbers, intervals)) for label, condition, numbers in lines]
@@ -97,6 +99,7 @@ def write_evaluation(
     stored: StoredPolicy,
     car: Mapping[str, Evaluation] | None = None,
     places: Mapping[str, Sequence[Standing]] | None = None,
+    rival: tuple[str, str] | None = None,
 ) -> Path:
     """Write `evaluations/<time>.json` into a run's folder and return it.
 
@@ -107,6 +110,7 @@ def write_evaluation(
         stored: the checkpoint.
         car: what `race_car_parts` returns.
         places: what `official_places` returns.
+        rival: names of the run and checkpoint that drove the other car; None: there was none, or the policy itself.
 
     Raises:
         RunFailed: the file cannot be written.
@@ -118,6 +122,8 @@ def write_evaluation(
         "evaluation": asdict(config),
         **evaluation.as_dict(),
     }
+    if rival is not None:
+        content["rival"] = dict(zip(("run", "checkpoint"), rival, strict=True))
     if car is not None:
         content["real_car"] = car_figures(car)
     if places:
@@ -136,6 +142,7 @@ def _cells(statistics: Mapping[str, Any], intervals: bool) -> dict[str, str]:
     """Return a group's cells by column."""
     times = statistics["lap_time_s"]
     return {
+        "won %": _mean(statistics["won"], 0, intervals, 100.0) if "won" in statistics else NOTHING,
         "laps": f"{statistics['laps']} of {statistics['laps_tried']}",
         "crash-free %": _mean(statistics["crash_free"], 0, intervals, 100.0),
         "done %": _mean(statistics["completion"], 1, intervals),
@@ -169,18 +176,27 @@ def evaluate_run(plan: EvaluatePlan, video: Path | None, out: Console, err: Cons
     run, config = plan.run, plan.config.evaluation
     stored = run.read_policy()
     torch.set_num_threads(1)
-    evaluator = Evaluator(run.experiment, config)
+    rival = None if plan.rival is None else plan.rival.read_policy()
+    evaluator = Evaluator(
+        run.experiment, config, rival_sees=plan.rival.experiment.observation if plan.rival else None
+    )
     recorder = LapRecorder(evaluator)
     err.print(
-        f"{run.path.name}, checkpoint {stored.path.name}: {count(len(evaluator.trials), 'trial')}",
+        f"{run.path.name}, checkpoint {stored.path.name}: {count(len(evaluator.trials), 'trial')}"
+        + _against(plan, rival, evaluator),
         highlight=False,
     )
-    evaluation = evaluator(stored.networks.policy, recorder if video is not None else None)
+    evaluation = evaluator(
+        stored.networks.policy,
+        recorder if video is not None else None,
+        None if rival is None else rival.networks.policy,
+    )
     car = None
     if config.real_car is not None:
         car = race_car_parts(run.experiment, config, stored.networks.policy, evaluation)
     places = official_places(run.experiment, config, evaluation)
-    file = write_evaluation(run.path, evaluation, config, stored, car, places)
+    against = None if plan.rival is None or rival is None else (plan.rival.path.name, rival.path.name)
+    file = write_evaluation(run.path, evaluation, config, stored, car, places, against)
     trained = trained_on(run.experiment, config, evaluation)
     out.print(results_table(evaluation, config, trained, out))
     if car is not None:
@@ -209,6 +225,13 @@ def evaluate_run(plan: EvaluatePlan, video: Path | None, out: Console, err: Cons
     runs_dir = run.path.resolve().parent.parent
     deliver_evaluation(run.path, uri, runs_dir, stored.counters["env_steps"], metrics, files)
     return evaluation
+
+
+def _against(plan: EvaluatePlan, rival: StoredPolicy | None, evaluator: Evaluator) -> str:
+    """Return whom the policy races against, in words."""
+    if plan.rival is not None and rival is not None:
+        return f" against {plan.rival.path.name}, checkpoint {rival.path.name}"
+    return " against itself" * isinstance(evaluator.race, HeadToHead)
 
 
 def official_places(
@@ -258,6 +281,8 @@ def _metrics(evaluation: Evaluation, trained_on: Sequence[str]) -> dict[str, flo
     for group in evaluation.groups:
         label = labels[names.index(group.track)]
         if group.condition == USUAL:
+            if group.won:
+                metrics[evaluate_metric("eval_won", label)] = group.won_share
             metrics[evaluate_metric("eval_lap_time_s", label)] = group.mean_lap_time_s
             metrics[evaluate_metric("eval_completion", label)] = group.completion
             metrics |= {

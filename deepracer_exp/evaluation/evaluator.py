@@ -1,6 +1,6 @@
 """Race a policy under a protocol: all trials, tracks and conditions as one batch of cars."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -11,12 +11,12 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from deepracer_exp.config.compose import compose_experiment, compose_option
-from deepracer_exp.config.driving import RandomizationConfig
+from deepracer_exp.config.driving import ObservationConfig, RandomizationConfig
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.overrides import override_line
-from deepracer_exp.config.race import RaceConfig
 from deepracer_exp.config.track import TrackConfig
+from deepracer_exp.env.head_to_head import HeadToHead, rival_setup
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.real_car import as_the_car, require_car
 from deepracer_exp.env.setup import Course, build_setup
@@ -25,6 +25,8 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.source import NO_REWARD
 from deepracer_exp.tracks.track import directed_tracks
 
+from .head_to_head import RivalProtocol
+from .plan import race_of
 from .race_protocol import RaceProtocol
 from .result import HELD_OUT, USUAL, Evaluation, TrialGroup
 
@@ -57,7 +59,13 @@ class Evaluator:
         race: the cars.
     """
 
-    def __init__(self, experiment: Experiment, config: EvaluationConfig, threads: int = 0):
+    def __init__(
+        self,
+        experiment: Experiment,
+        config: EvaluationConfig,
+        threads: int = 0,
+        rival_sees: ObservationConfig | None = None,
+    ):
         """Build tracks and cars.
 
         Args:
@@ -65,6 +73,7 @@ class Evaluator:
                 not set.
             config: the protocol.
             threads: physics threads; 0 means one per core.
+            rival_sees: what the rival's policy observes, where the race is head to head; None: as the policy.
 
         Raises:
             BadInput: a track, a condition or a file is unknown or malformed, or the protocol is that of the car and
@@ -75,34 +84,45 @@ class Evaluator:
         conditions = {USUAL: _conditions("usual", config.usual, experiment)}
         if config.held_out is not None:
             conditions[HELD_OUT] = _conditions("held_out", config.held_out, experiment)
+        against_rival = race_of(experiment, config).rivals is not None
         self.trials = [
             EvaluationTrial(course=place, condition=condition, start_ndist=start)
             for place, course in enumerate(courses)
             for condition in conditions
-            for start in _starts(config, course.tracks[0].closed, condition)
+            for start in _starts(config, course.tracks[0].closed, condition, pairs=against_rival)
         ]
         setup = replace(
-            build_setup(experiment, courses, NO_REWARD, race=_race(config, experiment)),
+            build_setup(experiment, courses, NO_REWARD, race=race_of(experiment, config)),
             randomization=conditions[USUAL],
             # The protocol limits the time.
             episode=replace(experiment.episode, max_steps=0),
             seed=config.seed,
         )
+        rivals = rival_setup(setup, rival_sees or experiment.observation) if against_rival else None
         if config.real_car is not None:
             require_car(experiment)
             setup = as_the_car(setup, config.real_car)
         of_trials = [conditions[trial.condition] for trial in self.trials]
-        self.race = Race(setup, len(self.trials), threads, randomizations=of_trials)
+        self.race = (
+            Race(setup, len(self.trials), threads, randomizations=of_trials)
+            if rivals is None
+            else HeadToHead(
+                setup, len(self.trials), rivals, threads, randomizations=of_trials, puts_rivals_back=False
+            )
+        )
         self._course = np.array([trial.course for trial in self.trials])
         self._start_ndist = np.array([trial.start_ndist for trial in self.trials])
         self._closed = np.array([courses[trial.course].tracks[0].closed for trial in self.trials])
 
-    def __call__(self, policy: torch.nn.Module, on_step: OnStep | None = None) -> Evaluation:
+    def __call__(
+        self, policy: torch.nn.Module, on_step: OnStep | None = None, rival: torch.nn.Module | None = None
+    ) -> Evaluation:
         """Let the policy drive all trials and return the results.
 
         Args:
             policy: reads what the experiment observes, writes `action`.
             on_step: called after every control step.
+            rival: drives the other car of a race head to head; None: the policy itself.
 
         Raises:
             RunFailed: an action or a car's state became NaN or infinite.
@@ -110,6 +130,10 @@ class Evaluator:
         race, config = self.race, self.config
         among_others = race.others is not None
         protocol = RaceProtocol(config, self._closed, race.setup.car.control_period_s, among_others)
+        rivals = None
+        if isinstance(race, HeadToHead):
+            race.drive_with([rival or policy])
+            rivals = RivalProtocol(config, self._closed, race.setup.car.control_period_s)
         trace: list[NDArray[np.float64]] = []
         race.seed(config.seed)
         race.reset(None, self._course, self._start_ndist)
@@ -125,6 +149,9 @@ class Evaluator:
                 race.step(acted["action"].numpy())
                 row = race.trace
                 trace.append(np.column_stack([row[:, _DRIVEN], protocol.running]))
+                if rivals is not None:
+                    assert isinstance(race, HeadToHead)
+                    rivals.step(race, protocol.running)
                 back = protocol.step(
                     row[:, PACKED["episode_status"]].astype(np.int64), row[:, PACKED["progress"]]
                 )
@@ -132,9 +159,12 @@ class Evaluator:
                     on_step(race, protocol, acted)
                 if len(back.cars):
                     race.put_back(*back)
-        return Evaluation(tuple(self._groups(protocol, np.stack(trace, axis=1))), among_others)
+        won = () if rivals is None else rivals.results(protocol)
+        return Evaluation(tuple(self._groups(protocol, np.stack(trace, axis=1), won)), among_others)
 
-    def _groups(self, protocol: RaceProtocol, trace: NDArray[np.float64]) -> list[TrialGroup]:
+    def _groups(
+        self, protocol: RaceProtocol, trace: NDArray[np.float64], won: Sequence[float]
+    ) -> list[TrialGroup]:
         zigzags = [self._zigzag(trial.course, rows) for trial, rows in zip(self.trials, trace, strict=True)]
         names = [course.name for course in self.race.setup.courses]
         rows: dict[tuple[str, str], list[int]] = {}
@@ -147,6 +177,7 @@ class Evaluator:
                 tuple(trials),
                 tuple(a for a in protocol.attempts if a.trial in set(trials)),
                 tuple(zigzags[trial] for trial in trials),
+                tuple(won[trial] for trial in trials) if won else (),
             )
             for (track, condition), trials in rows.items()
         ]
@@ -199,20 +230,12 @@ def _conditions(key: str, option: str | None, experiment: Experiment) -> Randomi
         raise BadInput(f"evaluation.{key}", error) from None
 
 
-def _race(config: EvaluationConfig, experiment: Experiment) -> RaceConfig:
-    if config.race is None:
-        return experiment.race
-    try:
-        return compose_option("race", config.race, RaceConfig)
-    except BadInput as error:
-        raise BadInput("evaluation.race", error) from None
-
-
-def _starts(config: EvaluationConfig, closed: bool, condition: str) -> NDArray[np.float64]:
-    """Return the start of each trial as a share of the lap, (trials,)."""
-    trial = np.arange(config.trials)
+def _starts(config: EvaluationConfig, closed: bool, condition: str, pairs: bool) -> NDArray[np.float64]:
+    """Return the start of each trial as a share of the lap, (trials,); of `pairs`, each has one start for both."""
     if not closed:
         return np.zeros(config.trials)
+    size = 2 if pairs else 1
+    place, places = np.arange(config.trials) // size, -(-config.trials // size)
     if config.starts is not None:
-        return np.array(config.starts)[trial % len(config.starts)]
-    return (trial + (0.5 if condition == HELD_OUT else 0.0)) / config.trials
+        return np.array(config.starts)[place % len(config.starts)]
+    return (place + (0.5 if condition == HELD_OUT else 0.0)) / places

@@ -4,13 +4,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from deepracer_exp.config.compose import compose_evaluation
+from deepracer_exp.config.compose import compose_evaluation, compose_option
 from deepracer_exp.config.evaluation import EvaluateConfig, EvaluationConfig
+from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.overrides import group_of
 from deepracer_exp.config.own_class import OF_POLICY
 from deepracer_exp.config.parse import import_own_classes
+from deepracer_exp.config.race import RaceConfig
 from deepracer_exp.env.real_car import require_car
+from deepracer_exp.errors import BadInput
 from deepracer_exp.lookup.resolve import StoredRun, resolve
+from deepracer_exp.lookup.rival import find_rival
 
 
 @dataclass(frozen=True)
@@ -22,14 +26,16 @@ class EvaluatePlan:
     config: EvaluateConfig
     training_protocol: EvaluationConfig
     """The protocol that was named; if none was, the one by which the training evaluated."""
+    rival: StoredRun | None = None
+    """The run, with its checkpoint, that drives the rival; None: there is none, or it is the policy itself."""
 
 
 def plan_evaluation(run: str, overrides: Sequence[str], *, has_checkpoint: bool = True) -> EvaluatePlan:
     """Compose an evaluation, and find the run that it races, and its checkpoint if `has_checkpoint`.
 
     Raises:
-        BadInput: as for `compose_evaluation`, `resolve` and `StoredRun.with_policy`, or the physical car could not
-            run the policy.
+        BadInput: as for `compose_evaluation`, `resolve`, `StoredRun.with_policy` and `find_rival`, a rival is named for
+            a race without one, or the physical car could not run the policy.
     """
     config, _ = compose_evaluation(overrides)
     stored = resolve(run, Path(config.runs_dir), config.tracking.uri)
@@ -39,5 +45,35 @@ def plan_evaluation(run: str, overrides: Sequence[str], *, has_checkpoint: bool 
         import_own_classes(stored.experiment, OF_POLICY)
     if config.evaluation.real_car is not None:
         require_car(stored.experiment)
+    rival = _rival(stored.experiment, config)
     is_named = any(group_of(override) == "evaluation" for override in overrides)
-    return EvaluatePlan(stored, config, config.evaluation if is_named else stored.experiment.evaluation)
+    protocol = config.evaluation if is_named else stored.experiment.evaluation
+    return EvaluatePlan(stored, config, protocol, rival)
+
+
+def race_of(experiment: Experiment, config: EvaluationConfig) -> RaceConfig:
+    """Return the race of a protocol, or that of the experiment.
+
+    Raises:
+        BadInput: there is no such option.
+    """
+    if config.race is None:
+        return experiment.race
+    try:
+        return compose_option("race", config.race, RaceConfig)
+    except BadInput as error:
+        raise BadInput("evaluation.race", error) from None
+
+
+def _rival(experiment: Experiment, config: EvaluateConfig) -> StoredRun | None:
+    rivals = race_of(experiment, config.evaluation).rivals
+    key, run, checkpoint = "rival", config.rival, config.rival_checkpoint
+    if rivals is None:
+        if run is not None:
+            raise BadInput(f"rival={run}", "this race has none", "evaluation=head_to_head")
+        return None
+    if run is None and not rivals.is_own:
+        key, run, checkpoint = "race.rivals.policy", rivals.policy, rivals.checkpoint
+    if run is None:
+        return None
+    return find_rival(key, run, checkpoint, experiment, Path(config.runs_dir), config.tracking.uri)

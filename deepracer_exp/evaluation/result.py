@@ -42,6 +42,8 @@ class TrialGroup:
     attempts: tuple[Attempt, ...]
     zigzags: "tuple[ZigZag, ...]" = ()
     """Zig-zag of each trial; empty where it was not measured."""
+    won: tuple[float, ...] = ()
+    """Result of each trial against a rival: 1 won, 0.5 drawn, 0 lost; empty where there was none."""
 
     @property
     def decided(self) -> list[Attempt]:
@@ -68,6 +70,11 @@ class TrialGroup:
     def crash_free_share(self) -> float:
         """Complete laps without a crash per attempted lap."""
         return sum(attempt.crash_free for attempt in self.decided) / len(self.decided)
+
+    @property
+    def won_share(self) -> float:
+        """Races won per race, a draw counting half; NaN where there was no rival."""
+        return float(np.mean(self.won)) if self.won else math.nan
 
     @property
     def mean_lap_time_s(self) -> float | None:
@@ -130,6 +137,7 @@ class TrialGroup:
             "crash_free": _mean(self._per_trial(decided, lambda a: float(a.crash_free)), count),
             "race_score_s": self.race_score_s,
             "zigzag": self._zigzag_statistics(),
+            **({"won": _mean(np.array(self.won), once)} if self.won else {}),
         }
 
     def _zigzag_statistics(self) -> dict[str, Any]:
@@ -240,6 +248,7 @@ def _together(groups: Sequence[TrialGroup], track: str, condition: str) -> Trial
         tuple(trial for group in groups for trial in group.trials),
         tuple(attempt for group in groups for attempt in group.attempts),
         tuple(zigzag for group in groups for zigzag in group.zigzags),
+        tuple(result for group in groups for result in group.won),
     )
 
 

@@ -24,6 +24,10 @@ METRICS: Mapping[str, tuple[str, str]] = {
         "race/crash_free",
         "share of its laps on usual conditions that were completed without running into a box or bot (0 to 1)",
     ),
+    "eval_won": (
+        "race/won",
+        "share of its races on usual conditions that were won, a draw counting half (0 to 1)",
+    ),
     "eval_zigzag_per_m": (
         "race/zigzag_per_m",
         "changes of steering from one side to the other a metre of straight, usual conditions",

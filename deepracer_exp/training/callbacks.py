@@ -11,6 +11,7 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.reports.run_page import write_pictures, write_run_page
 from deepracer_exp.runs.result import FINISHED, STOPPED_EARLY, Ending
 from deepracer_exp.stopping.rules import Decision, StoppingRule, build_rule
@@ -22,7 +23,7 @@ from deepracer_exp.tracking.tracker import FINISH_S, Tracker
 from .budget import Alerts
 from .display import ProgressDisplay, RunHeader
 from .machine import machine_use
-from .metrics import NOT_EVALUATED, eval_columns
+from .metrics import AMONG_OTHERS, NOT_EVALUATED, eval_columns
 from .trainer import Callback, Trainer, TrainResult
 
 logger = logging.getLogger("deepracer_exp")
@@ -35,6 +36,7 @@ def standard_callbacks(
     tracker: Tracker,
     console: Console,
     users: Sequence[Callback] = (),
+    rival: StoredRun | None = None,
 ) -> list[Callback]:
     """Return the callbacks of a run in the order in which they are called.
 
@@ -46,12 +48,13 @@ def standard_callbacks(
         console: shows the progress.
         users: the caller's, called after evaluation and stopping rule and before anything is recorded: columns that
             they add to `trainer.row` are recorded, and an iteration at which one raises is not.
+        rival: the other run that the evaluation races against, too; None: it has none, or its own snapshots.
 
     Raises:
         BadInput: files or values of the evaluation or the alerts cannot be used.
     """
     return [
-        EvalCallback(experiment, console),
+        EvalCallback(experiment, console, rival),
         StoppingCallback(build_rule(experiment.stopping, setup.actions.n), tracker),
         *users,
         BudgetCallback(Alerts(experiment.budget), tracker),
@@ -65,8 +68,8 @@ def standard_callbacks(
 class EvalCallback(Callback):
     """Evaluates the policy every few iterations on the trials of group `evaluation`, the same each time."""
 
-    def __init__(self, experiment: Experiment, console: Console):
-        """Read what is to be driven.
+    def __init__(self, experiment: Experiment, console: Console, rival: StoredRun | None = None):
+        """Read what is to be driven; `rival` as for `standard_callbacks`.
 
         Raises:
             BadInput: a track or a condition is unknown or malformed.
@@ -74,12 +77,17 @@ class EvalCallback(Callback):
         self._every = experiment.checkpoints.every
         self._console = console
         # The cars of the training wait meanwhile, so that all cores are free.
-        self._evaluator = None if self._every is None else Evaluator(experiment, experiment.evaluation)
+        sees = None if rival is None else rival.experiment.observation
+        self._evaluator = (
+            None if self._every is None else Evaluator(experiment, experiment.evaluation, rival_sees=sees)
+        )
 
     def on_replay(self, trainer: Trainer) -> None:
         """Remove the evaluation of a policy that was evaluated only because the run ended there."""
         if not self._is_due(trainer.row["iteration"]):
             trainer.row |= NOT_EVALUATED
+            for column in AMONG_OTHERS:
+                trainer.row.pop(column, None)
 
     def on_iteration_end(self, trainer: Trainer) -> None:
         """Evaluate when due, and keep a checkpoint of what was evaluated."""
@@ -102,7 +110,8 @@ class EvalCallback(Callback):
 
     def _evaluate(self, trainer: Trainer) -> None:
         assert self._evaluator is not None
-        trainer.evaluation = self._evaluator(trainer.networks.policy)
+        rival = None if trainer.rivals is None else trainer.rivals.newest_policy()
+        trainer.evaluation = self._evaluator(trainer.networks.policy, rival=rival)
         trainer.row |= eval_columns(trainer.evaluation)
 
 

@@ -297,10 +297,12 @@ EVAL_COLUMNS = (
     "eval_zigzag_lost_s",
 )
 NOT_EVALUATED: dict[str, float | None] = dict.fromkeys(EVAL_COLUMNS)
+AMONG_OTHERS = ("eval_crash_free", "eval_won")
+"""Further columns of an evaluation among boxes or bots, or against a rival, in rows with an evaluation only."""
 
 
 def eval_columns(evaluation: Evaluation) -> dict[str, float | None]:
-    """Return the columns of an evaluation in metrics.jsonl: `EVAL_COLUMNS`, and among others `eval_crash_free`."""
+    """Return the columns of an evaluation in metrics.jsonl: `EVAL_COLUMNS`, and of `AMONG_OTHERS` what there is."""
     usual = evaluation.on(USUAL)
     held_out = evaluation.on(HELD_OUT) if HELD_OUT in evaluation.conditions else None
     return {
@@ -313,4 +315,5 @@ def eval_columns(evaluation: Evaluation) -> dict[str, float | None]:
         "eval_race_score_s": evaluation.race_score_s,
         **zigzag_columns(usual),
         **({"eval_crash_free": usual.crash_free_share} if evaluation.among_others else {}),
+        **({"eval_won": usual.won_share} if usual.won else {}),
     }

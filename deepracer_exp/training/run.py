@@ -25,6 +25,7 @@ from deepracer_exp.config.learning import PPOConfig, SACConfig
 from deepracer_exp.config.own_class import own_classes
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.errors import NO_MEMORY, BadInput, RunFailed, count, is_refused_memory, reading
+from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.rewards.reward import RewardFunction
 from deepracer_exp.runs.checkpoints import check, checkpoint_name, intact_checkpoint, read_training
 from deepracer_exp.runs.files import (
@@ -33,7 +34,9 @@ from deepracer_exp.runs.files import (
     LINEAGE,
     METRICS,
     REWARD,
+    RIVAL,
     SUMMARY,
+    TEACHER,
     TRACKING,
     read_object,
 )
@@ -51,11 +54,13 @@ from deepracer_exp.tracking.tracking_file import TrackedRun, begin_again, read_t
 from .budget import refuse_spent
 from .callbacks import standard_callbacks
 from .clone import describe_clone, read_parent
+from .kept_policy import keep_policy
 from .memory import memory_needed
 from .metrics import track_names
 from .plan import ResumePlan, TrainPlan
+from .rivals import kept_rival
 from .signals import Interruption
-from .teacher import check_teacher, keep_teacher
+from .teacher import check_teacher
 from .trainer import Callback, TakenOver, Trainer, TrainResult
 
 logger = logging.getLogger("deepracer_exp")
@@ -202,13 +207,15 @@ def _begin(
     created: Callable[[Path], None] | None = None,
 ) -> Trainer:
     """Create the folder of a new run and record it."""
-    experiment, composition, teacher = plan.experiment, plan.composition, None
+    experiment, composition, teacher, rival = plan.experiment, plan.composition, None, None
     refuse_spent(experiment.budget, Path(experiment.runs_dir) / experiment.name)
     if plan.teacher is not None:
         teacher = check_teacher(plan.teacher, experiment)
+    if plan.rival is not None:
+        rival = StoredRun(plan.rival.path, plan.rival.read_policy().path.name)
     tracker = open_tracker(experiment.tracking, Path(experiment.runs_dir))
     names = _names(composition, joined(track_names(setup)), setup.reward.name)
-    every = standard_callbacks(experiment, setup, names, tracker, console, callbacks)
+    every = standard_callbacks(experiment, setup, names, tracker, console, callbacks, rival)
     label = f"{names['track']}-{names['reward']}-seed{experiment.seed}"
     lineage = None if start is None else start[1]
     if lineage is not None:
@@ -216,7 +223,9 @@ def _begin(
     folder = RunFolder.create(experiment.runs_dir, experiment.name, label)
     try:
         if teacher is not None:
-            keep_teacher(teacher, folder.path)
+            keep_policy(teacher, folder.path / TEACHER)
+        if rival is not None:
+            keep_policy(rival, folder.path / RIVAL)
         trainer = Trainer(experiment, setup, folder, composition.mapping, every)
         if start is not None:
             trainer.agent.begin_with(start[0])
@@ -242,6 +251,8 @@ def _begin(
         logger.info(note)
     if teacher is not None:
         logger.info("teacher: %s, checkpoint %s", teacher.path, teacher.checkpoint)
+    if rival is not None:
+        logger.info("rival: %s, checkpoint %s", rival.path, rival.checkpoint)
     tracker.open(folder.path, _described(trainer, composition, names, commit, run_name, tags))
     return trainer
 
@@ -290,7 +301,8 @@ def _reopen(
     _try(experiment, setup)
     _forget_damaged_best(run_dir, state)
     tracker = open_tracker(experiment.tracking, Path(experiment.runs_dir))
-    every = standard_callbacks(experiment, setup, names, tracker, console, callbacks)
+    rival = kept_rival(experiment, run_dir)
+    every = standard_callbacks(experiment, setup, names, tracker, console, callbacks, rival)
     folder = RunFolder(run_dir)
     iteration = state["iteration"]
     try:

@@ -1,6 +1,5 @@
 """The policy that a new one first learns to act like (`algorithm=distill teacher=RUN`)."""
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,8 +9,9 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.action_space import build_action_space, describe_actions
 from deepracer_exp.errors import BadInput
 from deepracer_exp.lookup.resolve import StoredRun
-from deepracer_exp.runs.checkpoints import check, read_policy
-from deepracer_exp.runs.files import CHECKPOINTS, CONFIG, TEACHER
+from deepracer_exp.runs.files import TEACHER
+
+from .kept_policy import read_kept_policy
 
 
 def check_teacher(run: StoredRun, experiment: Experiment) -> StoredRun:
@@ -41,28 +41,10 @@ def check_teacher(run: StoredRun, experiment: Experiment) -> StoredRun:
     return StoredRun(run.path, stored.path.name)
 
 
-def keep_teacher(run: StoredRun, folder: Path) -> None:
-    """Copy configuration and checkpoint of a teacher into the folder of a new run, which then needs no other.
-
-    Raises:
-        OSError: they cannot be copied.
-    """
-    assert run.checkpoint is not None
-    shutil.copytree(run.checkpoints / run.checkpoint, folder / TEACHER / CHECKPOINTS / run.checkpoint)
-    shutil.copy(run.path / CONFIG, folder / TEACHER / CONFIG)
-
-
 def read_teacher(folder: Path) -> TensorDictModuleBase:
     """Return the teacher's policy that is kept in a run's folder.
 
     Raises:
         BadInput: it is missing or corrupt.
     """
-    kept = StoredRun(folder / TEACHER)
-    try:
-        (checkpoint,) = kept.checkpoints.iterdir()
-    except (OSError, ValueError) as error:
-        raise BadInput(
-            kept.checkpoints, "is not one checkpoint, which a run with a teacher has there"
-        ) from error
-    return read_policy(kept.experiment, check(checkpoint)).networks.policy
+    return read_kept_policy(folder / TEACHER).networks.policy

@@ -37,6 +37,7 @@ from deepracer_exp.sim.batch import cores
 from .best import BestPolicy
 from .budget import Budget
 from .metrics import NOT_EVALUATED, Finished, RunMetrics, track_names
+from .rivals import RivalPool, kept_rival
 from .signals import Interruption
 from .teacher import read_teacher
 
@@ -131,6 +132,7 @@ class Trainer:
         callbacks: in the order in which they are called.
         networks: policy and value.
         agent: what improves them.
+        rivals: whom it races against, None: nobody.
         metrics: episodes and laps so far.
         budget: the limits and how much of them is used.
         checkpoints: the run's own.
@@ -196,6 +198,12 @@ class Trainer:
             if isinstance(setup.actions, DiscreteActions)
             else None,
         )
+        rivals = experiment.race.rivals
+        self.rivals = (
+            None
+            if rivals is None
+            else RivalPool(rivals, setup, self.networks.policy, kept_rival(experiment, folder.path))
+        )
         self.iteration, self.env_steps = 0, 0
         self.row: dict[str, Any] = {}
         self.evaluation: Evaluation | None = None
@@ -239,6 +247,8 @@ class Trainer:
                 collector.publish_policy()
                 update_s = time.monotonic() - began
                 self.iteration += 1
+                if self.rivals is not None and self.rivals.take(self.iteration):
+                    collector.publish_rivals(self.rivals.driving)
 
                 # 3. Measure: one row of metrics, the steps of the trace.
                 self.row = self._measure(finished, update, batch.numel(), collect_s, update_s)
@@ -297,6 +307,8 @@ class Trainer:
         }
         for callback in self.callbacks:
             state |= callback.state_dict()
+        if self.rivals is not None:
+            state |= self.rivals.state_dict()
         state |= self.best.state_dict()
         self.checkpoints.save(self.agent, self.counters(), state, best=best)
         if collector is not None:
@@ -320,6 +332,8 @@ class Trainer:
         self._process_began -= state["wall_clock_s"]
         for callback in self.callbacks:
             callback.load_state_dict(state)
+        if self.rivals is not None:
+            self.rivals.load_state_dict(state)
         self.best.load_state_dict(state)
 
     def replay(self, rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -411,6 +425,8 @@ class Trainer:
         if self.ending is not None:
             return None
         experiment = self.experiment
+        if self.rivals is not None and not self.iteration:
+            self.rivals.take(0)
         return self.running.enter_context(
             open_collector(
                 experiment.collector,
@@ -418,7 +434,8 @@ class Trainer:
                 self.setup,
                 self.networks.policy,
                 self.folder.path,
-                state=self._cars,
+                self._cars,
+                None if self.rivals is None else self.rivals.rivals,
             )
         )
 

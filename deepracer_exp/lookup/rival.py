@@ -1,0 +1,45 @@
+"""The run whose policy drives the rivals of a race head to head."""
+
+from pathlib import Path
+
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.env.action_space import build_action_space, describe_actions
+from deepracer_exp.errors import BadInput
+
+from .resolve import StoredRun, resolve
+
+
+def find_rival(
+    key: str,
+    run: str,
+    checkpoint: str | None,
+    experiment: Experiment,
+    runs_dir: Path,
+    tracking_uri: str | None,
+) -> StoredRun:
+    """Find a run and its checkpoint, whose policy has the actions of those that race against it.
+
+    With other actions not the better policy would win but the faster car. What it sees may differ.
+
+    Args:
+        key: of the configuration, for messages.
+        run: as for `resolve`.
+        checkpoint: as for `StoredRun.with_checkpoint`.
+        experiment: of the policy that races against it.
+        runs_dir: where runs are.
+        tracking_uri: as for `resolve`.
+
+    Raises:
+        BadInput: as for `resolve` and `StoredRun.with_policy`, or the actions differ.
+    """
+    what = f"{key}={run}"
+    try:
+        stored = resolve(run, runs_dir, tracking_uri).with_policy(checkpoint)
+    except BadInput as error:
+        raise BadInput(what, error.without(run)) from None
+    theirs, ours = (
+        describe_actions(build_action_space(side.action_space)) for side in (stored.experiment, experiment)
+    )
+    if theirs != ours:
+        raise BadInput(what, f"has other actions: {theirs}", f"a run with {ours}")
+    return stored
