@@ -246,7 +246,11 @@ def _film(lap: "FastestLap", track: "Track", experiment: "Experiment", args: arg
         title=f"{track.title} · fastest lap",
         steering_rad=np.radians(lap.column("steering_deg")),
         time_s=lap.column("time_s"),
-        **{name: lap.column(name) for name in ("x_m", "y_m", "yaw_rad", "speed_mps", "progress")},
+        x_m=lap.column("x_m"),
+        y_m=lap.column("y_m"),
+        yaw_rad=lap.column("yaw_rad"),
+        speed_mps=lap.column("speed_mps"),
+        progress=lap.column("progress"),
     )
     write_video(Path(args.video), film_lap, experiment.car, Console(stderr=True))
     print(f"\nfilm: {args.video}")

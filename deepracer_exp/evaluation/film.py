@@ -16,8 +16,9 @@ from tensordict import TensorDict
 from torch import nn
 
 from deepracer_exp.env.race import Race
-from deepracer_exp.env.trace import PACKED
+from deepracer_exp.env.trace import PACKED, STATUS_CODE
 from deepracer_exp.errors import RunFailed, writing
+from deepracer_exp.sim.scenery import box_corners
 from deepracer_exp.tracks.track import Track
 
 from .evaluator import Evaluator
@@ -48,9 +49,21 @@ class Lap:
     """Per cent of this lap."""
     time_s: NDArray[np.float64]
     """Seconds since the start of the lap, penalties included."""
+    others: NDArray[np.float64] | None = None
+    """Boxes and bots as cameras see them (`sim.camera.take_pictures`), (n, K, 9); None: the car is alone."""
+    held: NDArray[np.bool_] | None = None
+    """Whether the car stands for the seconds of a penalty, (n,), among others."""
 
     def __len__(self) -> int:
         return len(self.time_s)
+
+    @property
+    def boxes(self) -> NDArray[np.float64]:
+        """Return the corners of the others that stand still through the lap, (k, 4, 2)."""
+        if self.others is None:
+            return np.zeros((0, 4, 2))
+        still = (self.others[..., :3] == self.others[:1, :, :3]).all(axis=(0, 2))
+        return box_corners(self.others[0, still]).astype(np.float64)
 
     def share(self, step: int) -> float:
         """Return the share of the lap driven before a step."""
@@ -62,13 +75,23 @@ def in_frames(lap: Lap, control_hz: float) -> tuple[Lap, NDArray[np.intp]]:
 
     `control_hz` is how many steps the lap has in a second. Where the car was put back onto the track it does not drive.
     """
+    held = np.zeros(len(lap), bool) if lap.held is None else lap.held
     time_steps = np.append(np.arange(0.0, len(lap) - 1, control_hz / FRAMES_PER_S), len(lap) - 1)
     step = time_steps.astype(np.intp)
     after = np.minimum(step + 1, len(lap) - 1)
-    part = np.where(lap.time_s[after] - lap.time_s[step] > 1.5 / control_hz, 0.0, time_steps - step)
+    passed = time_steps - step
+    put_back = (lap.time_s[after] - lap.time_s[step] > 1.5 / control_hz) | (held[after] & ~held[step])
+    part = np.where(put_back, 0.0, passed)
 
     def between(values: NDArray[np.float64]) -> NDArray[np.float64]:
         return values[step] + part * (values[after] - values[step])
+
+    others = lap.others
+    if others is not None:
+        # Bots drive on while the car is put back.
+        others = others.copy()
+        others[..., 2] = np.unwrap(others[..., 2], axis=0)
+        others = others[step] + passed[:, None, None] * (others[after] - others[step])
 
     shown = replace(
         lap,
@@ -79,6 +102,8 @@ def in_frames(lap: Lap, control_hz: float) -> tuple[Lap, NDArray[np.intp]]:
         speed_mps=between(lap.speed_mps),
         progress=between(lap.progress),
         time_s=between(lap.time_s),
+        others=others,
+        held=held[step],
     )
     return shown, step
 
@@ -96,11 +121,14 @@ class LapRecorder:
         """
         self._evaluator, self._seen_in = evaluator, seen_in
         self._steps: list[NDArray[np.float64]] = []
+        self._others: list[NDArray[np.float32]] = []
         self._acted: list[TensorDict] = []
 
     def __call__(self, race: Race, protocol: RaceProtocol, acted: TensorDict) -> None:
         """Record one control step."""
         self._steps.append(np.column_stack([race.trace, protocol.clock_s]))
+        if race.others is not None:
+            self._others.append(race.others.boxes(np.arange(race.n_cars)))
         if self._seen_in is not None:
             trial = self._seen_in.trial
             before = self._steps[-2][trial, -1] if len(self._steps) > 1 else -1.0
@@ -128,7 +156,7 @@ class LapRecorder:
         """Return the poses of a lap."""
         trial, setup = self._evaluator.trials[attempt.trial], self._evaluator.race.setup
         track = setup.courses[trial.course].tracks[0]
-        _, rows = self.rows(attempt)
+        steps, rows = self.rows(attempt)
         x_m, y_m, yaw_deg, steering_deg, speed_mps, progress = rows[:, _COLUMNS].T
         time_s = rows[:, -1] - attempt.begin_s
         return Lap(
@@ -143,6 +171,10 @@ class LapRecorder:
             # A flying lap starts with the last pose of the one before, which has that lap's progress.
             progress=np.where(time_s > 0, progress, 0.0),
             time_s=time_s,
+            others=np.array([self._others[step][attempt.trial] for step in steps], np.float64)
+            if self._others
+            else None,
+            held=rows[:, PACKED["episode_status"]] == STATUS_CODE["pause"],
         )
 
 

@@ -38,7 +38,8 @@ def can_draw() -> bool:
 
 def render_lap(lap: Lap, car: CarConfig) -> Iterator[NDArray[np.uint8]]:
     """Render a lap in frames with MuJoCo, (HEIGHT, WIDTH, 3) each; poses are given, nothing is simulated."""
-    model, camera = _build(lap.track, car), mujoco.MjvCamera()
+    others = np.zeros((len(lap), 0, 9)) if lap.others is None else lap.others
+    model, camera = _build(lap.track, car, others[0]), mujoco.MjvCamera()
     data = mujoco.MjData(model)
     camera.type = mujoco.mjtCamera.mjCAMERA_FREE
     place, steer, spin = (
@@ -59,6 +60,11 @@ def render_lap(lap: Lap, car: CarConfig) -> Iterator[NDArray[np.uint8]]:
             data.qpos[place] = com_x_m[frame] - car.com_x_m, com_y_m[frame], yaw_rad
             data.qpos[steer] = lap.steering_rad[frame]
             data.qpos[spin] = turned_rad[frame]
+            data.mocap_pos[:, :2] = others[frame, :, :2]
+            data.mocap_quat[:, 0], data.mocap_quat[:, 3] = (
+                np.cos(0.5 * others[frame, :, 2]),
+                np.sin(0.5 * others[frame, :, 2]),
+            )
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             mujoco.mj_camlight(model, data)
@@ -73,7 +79,8 @@ def render_lap(lap: Lap, car: CarConfig) -> Iterator[NDArray[np.uint8]]:
             yield renderer.render()
 
 
-def _build(track: Track, car: CarConfig) -> mujoco.MjModel:
+def _build(track: Track, car: CarConfig, others: NDArray[np.float64]) -> mujoco.MjModel:
+    """Build what is seen: the car on its track, and boxes and bots that are moved, (K, 9)."""
     low, high = extent(track)
     spec = build_spec(car, visual=True)
     vis = spec.visual
@@ -102,6 +109,11 @@ def _build(track: Track, car: CarConfig) -> mujoco.MjModel:
         ("ground", [0, 0, -0.01], [0, 0, 1]),
     ):
         spec.worldbody.add_geom(name=name, type=plane, pos=pos, size=size, material=name, **seen)
+    for length, width, height, *color in others[:, 3:].tolist():
+        body = spec.worldbody.add_body(mocap=True)
+        half_m = (0.5 * length, 0.5 * width, 0.5 * height)
+        rgba = (*(part / 255 for part in color), 1.0)
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=(0, 0, half_m[2]), size=half_m, rgba=rgba, **seen)
     return spec.compile()
 
 
@@ -128,6 +140,8 @@ def _overlay(picture: NDArray[np.uint8], lap: Lap, frame: int) -> NDArray[np.uin
     white = (255, 255, 255, 255)
     # Right-aligned, so that the numbers do not jump.
     draw.text((150, 46), f"{lap.time_s[frame]:.2f} s", font=large, fill=white, anchor="ra")
+    if lap.held is not None and lap.held[frame]:
+        draw.text((right + 30, 22), "penalty", font=small, fill=(245, 166, 35, 255))
     draw.text((right, 46), f"{max(lap.speed_mps[frame], 0.0):.2f} m/s", font=large, fill=white, anchor="ra")
     draw.rectangle((30, 98, right, 108), fill=(255, 255, 255, 60))
     draw.rectangle((30, 98, 30 + (right - 30) * lap.share(frame), 108), fill=(245, 166, 35, 255))

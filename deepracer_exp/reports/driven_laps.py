@@ -122,4 +122,5 @@ def _replayed(recorder: LapRecorder, attempt: Attempt, run: StoredRun, words: st
         yaw_deg=np.degrees(lap.yaw_rad),
         speed_mps=lap.speed_mps,
         steering_deg=np.degrees(lap.steering_rad),
+        others=None if lap.others is None else lap.others[..., :2],
     )

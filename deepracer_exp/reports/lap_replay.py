@@ -49,6 +49,16 @@ class ReplayedLap:
     yaw_deg: Values
     speed_mps: Values
     steering_deg: Values
+    others: NDArray[np.float64] | None = None
+    """x and y of the boxes and bots on the road, (n, K, 2); None: the car is alone, or they are not known."""
+
+    @property
+    def others_by_key(self) -> dict[str, Values]:
+        """X and y of each of the others, (n,), by the keys that move its point."""
+        if self.others is None:
+            return {}
+        keys = [f"other_{axis}{number}" for number in range(self.others.shape[1]) for axis in "xy"]
+        return dict(zip(keys, self.others.reshape(len(self.others), -1).T, strict=True))
 
     @property
     def driven(self) -> Values:
@@ -178,6 +188,7 @@ def _values(lap: ReplayedLap, first: ReplayedLap) -> dict[str, list[float]]:
         "driven": driven + np.round(first.driven[0] - driven[0]),
         "speed": lap.speed_mps,
         "steering": lap.steering_deg,
+        **lap.others_by_key,
     }
     return {name: np.nan_to_num(some).round(_DIGITS).tolist() for name, some in values.items()}
 
@@ -189,6 +200,10 @@ def _chart(track: str, laps: Sequence[ReplayedLap]) -> Chart:
     curves: dict[str, list[Layer]] = {"speed": [], "steering": []}
     ends: dict[str, list[Layer]] = {"speed": [], "steering": []}
     for number, (letter, color, lap) in enumerate(zip("AB", COLORS, laps, strict=True)):
+        moved = list(lap.others_by_key.items())
+        for (key_x, xs), (key_y, ys) in zip(moved[::2], moved[1::2], strict=True):
+            paths.append(_moved(number, key_x, key_y, xs, ys, color))
+            paths[-1].marker.update(symbol="square", size=9)
         paths.append(line(lap.x_m, lap.y_m, color, letter, width=1.5))
         cars.append(_moved(number, "x", "y", lap.x_m, lap.y_m, color))
         cars[-1].update(mode="lines+markers", line={"width": 7, "color": color}, marker={"size": [1, 12]})
@@ -202,7 +217,9 @@ def _chart(track: str, laps: Sequence[ReplayedLap]) -> Chart:
         name="lap_replay",
         title=track,
         caption="Position on the track is counted along the centre line from waypoint 0; curves are broken where it "
-        "begins again. Behind: how much later a car came to where it is than the other one.",
+        "begins again. Behind: how much later a car came to where it is than the other one."
+        + " Squares are the boxes and bots around the car of their colour."
+        * any(lap.others is not None for lap in laps),
         rows=[
             [map_panel(laps[0].track, [*paths, *cars])],
             [Panel(layers=[*curves["speed"], *ends["speed"]], y_label="speed, m/s", x_range=(0.0, 100.0))],

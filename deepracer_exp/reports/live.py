@@ -183,7 +183,8 @@ def track_lines(evaluator: Evaluator, evaluation: Evaluation, recorder: LapRecor
         words += f", the fastest in {min(times_s):.2f} s" if len(times_s) else ""
         laps = [recorder.lap(attempt) for attempt in group.attempts]
         lines = [np.column_stack([lap.x_m, lap.y_m, lap.speed_mps]) for lap in laps if len(lap) > 1]
-        shown.append(TrackLines(course.tracks[0], words, lines))
+        boxes = np.concatenate([np.zeros((0, 4, 2)), *(lap.boxes for lap in laps)])
+        shown.append(TrackLines(course.tracks[0], words, lines, boxes))
     return shown
 
 

@@ -26,6 +26,7 @@ from deepracer_exp.evaluation.film import Lap, drive_best_lap, in_frames, write_
 from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.files import FILMS
 from deepracer_exp.sim.lidar import ANGLES_RAD, MOUNT_X_M
+from deepracer_exp.sim.scenery import box_corners
 from deepracer_exp.tracks.picture import draw_track, extent
 
 from .sight import degrees, picture_of, saliency, under_heat
@@ -35,6 +36,8 @@ _EYE = (480, 360)
 """Room for what the cameras see, and as much below it for where the policy looks."""
 _PAGE, _RULE, _INK, _FAINT, _CHOSEN, _BAR = "#14171a", "#343a42", "#f2f4f6", "#98a1ac", "#f5a623", "#5b87b8"
 _RAY = (255, 255, 255, 80)
+_DARK = 80
+"""Brightest of red, green and blue below which something is drawn lighter than it is."""
 _BOARD_HEIGHT, _ACTIONS_HEIGHT = 84, 216
 _FINER = 2
 
@@ -125,6 +128,8 @@ def _board(lap: Lap, at: int, width: int) -> Image.Image:
     words = (f"{lap.time_s[at]:.2f} s", f"{max(lap.speed_mps[at], 0.0):.2f} m/s", f"{100 * share:.0f}%")
     for right, text in zip((end - 240, end - 90, end), words, strict=True):
         draw.text((right, 12), text, font=_font(26), fill=_INK, anchor="ra")
+    if lap.held is not None and lap.held[at]:
+        draw.text((end - 340, 12), "penalty", font=_font(26), fill=_CHOSEN, anchor="ra")
     draw.rounded_rectangle((24, 56, end, 64), 4, fill=_RULE)
     draw.rounded_rectangle((24, 56, 24 + max(8, (end - 24) * share), 64), 4, fill=_CHOSEN)
     return image
@@ -162,6 +167,8 @@ class _Map:
         self._x, self._y = (corner + (np.stack([lap.x_m, lap.y_m], axis=1) - low) * step).T
         self._rays = None if rays is None else corner + (rays - low) * step
         self._yaw_rad = lap.yaw_rad
+        self._others = None if lap.others is None else corner + (box_corners(lap.others) - low) * step
+        self._colors_of_others = [] if lap.others is None else lap.others[0, :, 6:].astype(int).tolist()
         # The few steps after a standing start would take half of the colours.
         slow, fast = float(np.percentile(lap.speed_mps, 5)), float(lap.speed_mps.max())
         shares = (lap.speed_mps - slow) / max(fast - slow, 1e-6)
@@ -176,6 +183,12 @@ class _Map:
             pen.line(ends, fill=self._colors[frame], width=4 * _FINER)
         self._drawn = at
         now = self._canvas.copy()
+        if self._others is not None:
+            pen = ImageDraw.Draw(now)
+            for corners, color in zip(self._others[at].tolist(), self._colors_of_others, strict=True):
+                # Bots are nearly as dark as the road.
+                fill = _FAINT if max(color) < _DARK else tuple(color)
+                pen.polygon([tuple(point) for point in corners], fill, _INK, width=_FINER)
         if self._rays is not None:
             pen = ImageDraw.Draw(now, "RGBA")
             sensor, *ends = self._rays[step].tolist()

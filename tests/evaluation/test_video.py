@@ -7,16 +7,25 @@ from imageio_ffmpeg import read_frames
 
 from deepracer_exp.runs.files import read_config
 
+AHEAD = (
+    *("race=object_avoidance", "race.boxes.placement=fixed", "observation.next_objects=1"),
+    "race.boxes.positions=[{lap: 0.07, lane: inner}]",
+)
+"""A box where the car sees it at its start."""
 drawable = os.environ.get("MUJOCO_GL") or any(map(ctypes.util.find_library, ("EGL", "OSMesa")))
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not drawable, reason="this machine has neither EGL nor OSMesa")
 @pytest.mark.parametrize(
-    ("sees", "given"),
-    [((), ()), (("observation=camera", "budget.env_steps=256"), ("evaluation=real_car",))],
+    ("sees", "given", "box"),
+    [
+        ((), (), False),
+        (("observation=camera", "budget.env_steps=256"), ("evaluation=real_car",), False),
+        (AHEAD, (), True),
+    ],
 )
-def test_a_film_shows_the_car_on_its_way(copied, start, tmp_path, sees, given):
+def test_a_film_shows_the_car_on_its_way_and_what_is_on_the_road(copied, start, tmp_path, sees, given, box):
     """As fast as it drove, also where it acts more often than in the simulator."""
     folder = copied(*sees)
     ended = start(
@@ -37,3 +46,6 @@ def test_a_film_shows_the_car_on_its_way(copied, start, tmp_path, sees, given):
     assert np.abs(pictures[0] - pictures[-1]).max() > 60, "nothing moves"
     corner = pictures[0][:140, :350]
     assert (corner.min(axis=2) > 230).sum() > 100, "no figures to be seen"
+    red, green, blue = pictures[0].transpose(2, 0, 1) / np.maximum(pictures[0][..., 1], 1)
+    brown = (np.abs(red - 123 / 97) < 0.06) & (np.abs(blue - 79 / 97) < 0.06) & (green > 0)
+    assert bool(brown.sum() > 2000) is box

@@ -132,6 +132,48 @@ def test_a_film_has_thirty_frames_a_second_and_shows_another_picture_in_each(cir
         )
 
 
+@pytest.mark.parametrize(
+    ("race", "rgb"), [("object_avoidance", (123, 97, 79)), ("head_to_bot", (152, 161, 172))]
+)
+def test_a_film_shows_boxes_and_bots_from_above_where_they_are(circle, protocol, race, rgb):
+    asked = (f"race={race}", "race.bots.min_distance_m=1", "observation.next_objects=2")
+    experiment = compose_experiment([f"track.file={circle}", *asked])[0]
+    policy, lap, acted = driven(experiment, protocol("three_trials", trials=2, time_s=0.6))
+    assert lap.others.shape[1] == experiment.race.others
+    actions = build_action_space(experiment.action_space)
+    first, *_, last = Frames(lap, acted, policy, actions, experiment.observation, experiment.car)
+    brightest = np.abs(first.astype(int) - rgb).max(axis=2) < 25
+    assert brightest.sum() > 20 * experiment.race.others
+    moved = (first != last).any(axis=2) & brightest
+    assert bool(moved[100:500].sum() > 100) is (race == "head_to_bot"), "boxes stand and bots drive"
+
+
+def test_a_lap_has_the_boxes_of_its_own_trial_and_bots_drive_on_between_its_steps(protocol):
+    on = ("track=reInvent2019_track", "race=head_to_bot", "race.boxes.number=2", "observation.next_objects=2")
+    experiment = compose_experiment(on)[0]
+    evaluator = Evaluator(experiment, protocol("three_trials", trials=3, time_s=1), threads=1)
+    placed = []
+    recorder = LapRecorder(evaluator)
+
+    def record(race, *more):
+        placed.append(race.others.others.poses.copy())
+        recorder(race, *more)
+
+    observed = observation_shape(experiment.observation)
+    policy = build_actor_critic(
+        experiment.network, observed, evaluator.race.setup.actions.n, torch.Generator().manual_seed(0)
+    ).policy
+    attempt = evaluator(policy, record).groups[0].attempts[-1]
+    lap = recorder.lap(attempt)
+    expected = np.array(placed)[: len(lap), attempt.trial]
+    np.testing.assert_allclose(lap.others[..., :2], expected[..., :2], atol=1e-5)
+    assert len(lap.boxes) == 2
+    shown, _ = in_frames(lap, 15)
+    bots = shown.others[:, 2:, :2]
+    away_m = np.linalg.norm(np.diff(bots, axis=0), axis=2)[2 * 3 :]
+    assert (away_m > 0.5 * 0.75 / 30).all(), "a bot stands in a frame"
+
+
 @pytest.mark.parametrize("yaw_deg", [0, 180])
 def test_the_rays_of_a_film_end_at_the_walls(protocol, yaw_deg):
     own = (f"observation.lidar.{one}" for one in ("noise_m=0", "reach_m=12", f"yaw_deg={yaw_deg}"))
@@ -170,6 +212,23 @@ def test_between_steps_a_filmed_car_drives_on_but_not_where_it_was_put_back(circ
     assert np.abs(np.diff(shown.yaw_rad[step < 2])).max(initial=0) < 0.2
     if control_hz == 15:
         assert shown.x_m[:4] == pytest.approx([0.0, 0.05, 0.1, 0.15])
+
+
+def test_a_car_that_is_put_back_among_others_does_not_drive_there(circle):
+    x_m, nothing = np.array([0.0, 0.1, 3.0, 3.0, 3.0]), np.zeros(5)
+    held = np.array([False, False, True, True, False])
+    others = np.zeros((5, 1, 9))
+    others[:, 0, 0] = [0.0, 0.05, 0.1, 0.15, 0.2]
+    time_s = np.arange(5) / 15
+    lap = Lap(
+        *(None, Track.from_file(circle), "", x_m, nothing, nothing, nothing, nothing, nothing, time_s),
+        others=others,
+        held=held,
+    )
+    shown, _ = in_frames(lap, 15)
+    assert not ((shown.x_m > 0.1 + 1e-9) & (shown.x_m < 3.0)).any()
+    assert shown.others[:, 0, 0] == pytest.approx(0.025 * np.arange(9))
+    assert shown.held.tolist() == [False] * 4 + [True] * 4 + [False]
 
 
 def half(*_: object) -> tuple[str, float]:

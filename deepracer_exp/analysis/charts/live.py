@@ -7,9 +7,9 @@ import numpy as np
 import pandas as pd
 
 from .figure import Chart, Layer, Panel, colored_points, in_rows, line
-from .maps import map_panel
+from .maps import map_panel, outlines
 from .run_pictures import TrackLines
-from .style import BLUE, GREEN, ORANGE, PALE, PURPLE
+from .style import BLUE, GREEN, ORANGE, PALE, PURPLE, VERMILION
 
 _CURVES: Mapping[str, tuple[str, Mapping[str, tuple[str | None, str]]]] = {
     "Driven, per cent": (
@@ -68,10 +68,13 @@ def newest_laps(shown: Sequence[TrackLines]) -> Chart:
         if here.lines:
             x, y, speed_mps = np.concatenate(here.lines).T
             layers.append(colored_points(x, y, speed_mps, "speed, m/s", size=5.0, value_range=colors))
+        if len(here.boxes):
+            layers.append(outlines(here.boxes, VERMILION))
         panels.append(map_panel(here.track, layers, title=f"{here.track.title}: {here.words}"))
     return Chart(
         name="newest_laps",
         title="The laps of the newest checkpoint",
-        caption="One dot for each control step on the usual conditions, coloured by the speed of the car.",
+        caption="One dot for each control step on the usual conditions, coloured by the speed of the car."
+        + " The outlines are boxes; each lap has its own." * any(len(here.boxes) for here in shown),
         rows=in_rows(panels),
     )

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import matplotlib
 import numpy as np
@@ -12,6 +12,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.patches import Polygon
 from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import NDArray
 
@@ -26,6 +27,7 @@ LINE_COLUMNS = (
 )
 """Columns of a trace that `episodes` and `driven_lines` use."""
 ROAD, BORDER, CENTER, INK, FAINT = "#30343b", "#b9bfc8", "#6b727d", "#22262b", "#7b828c"
+BOX = "#7b614f"
 SPEED = LinearSegmentedColormap.from_list("speed", ["#e0457b", "#f58f3c", "#ffe14d", "#7fe3a1", "#4fd6ff"])
 """Colours from slow to fast; every one can be seen on the dark road."""
 BLUE, ORANGE, GREEN, PURPLE = "#2f6fb5", "#d9822b", "#2e8b57", "#7a5195"
@@ -94,6 +96,8 @@ class TrackLines:
     """Shown above it."""
     lines: Sequence[NDArray[np.float64]]
     """Columns x_m, y_m and speed_mps, of each line (n, 3)."""
+    boxes: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4, 2)))
+    """Corners of the boxes on the road, (k, 4, 2), metres."""
 
 
 def lines_figure(shown: Sequence[TrackLines]) -> Figure:
@@ -113,6 +117,8 @@ def lines_figure(shown: Sequence[TrackLines]) -> Figure:
     for axes, here in zip(cells.flat, shown, strict=False):
         _draw_road(axes, here.track)
         width = (3.0 if single else 1.8) / math.sqrt(max(len(here.lines), 1))
+        for corners in here.boxes:
+            axes.add_patch(Polygon(corners, facecolor=BOX, edgecolor="white", linewidth=0.8, zorder=3))
         lines += [_draw_line(axes, line, width, arrow=11.0 if single else 7.0) for line in here.lines]
         size = 11.0 if single else 8.5
         axes.set_title(
