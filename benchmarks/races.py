@@ -26,7 +26,6 @@ continues.
 """
 
 import argparse
-import math
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -35,10 +34,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
-from deepracer_exp.analysis.evidence import estimate
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.errors import BadInput
@@ -47,7 +44,16 @@ from deepracer_exp.evaluation.result import USUAL, TrialGroup
 
 from .command import at_once, read_metrics, read_summary, trained
 from .fresh import protocol, stored_policy
-from .report import benchmark_parser, number, percent, table, with_exit_code, write_json
+from .report import (
+    benchmark_parser,
+    iqm_text,
+    number,
+    over_seeds,
+    percent,
+    table,
+    with_exit_code,
+    write_json,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,17 +168,6 @@ def measure(run: Path, board: Board) -> dict[str, float | None]:
     return {name: None if value is None else round(value, 4) for name, value in figures.items()}
 
 
-def over_seeds(values: Sequence[float | None]) -> dict[str, Any]:
-    """Return `seeds`, `iqm` and `interval` of a figure, JSON types; no value is longer than any."""
-    found = estimate([np.array([math.inf if value is None else value for value in values])])
-    ends = None if found.interval is None else [_json(end) for end in found.interval]
-    return {"seeds": list(values), "iqm": _json(found.iqm), "interval": ends}
-
-
-def _json(value: float) -> float | None:
-    return round(value, 4) if math.isfinite(value) else None
-
-
 def benchmark(options: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
     """Train what is not in `folder` yet, race, and return a row for each experiment, track and car."""
     experiments, tracks, cars = (
@@ -221,12 +216,8 @@ HEAD = (
 
 def _cells(row: dict[str, Any]) -> tuple[str, ...]:
     def cell(name: str, digits: int = 2) -> str:
-        if name not in row:
-            return ""
-        figure = row[name]
-        ends = figure["interval"]
         show = percent if name.endswith("crash_free") else partial(number, digits=digits)
-        return show(figure["iqm"]) + ("" if ends is None else f" ({show(ends[0])} to {show(ends[1])})")
+        return iqm_text(row[name], show) if name in row else ""
 
     return (
         f"{row['experiment']}, {row['track']}, {row['car']}",

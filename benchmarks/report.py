@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import ttest_1samp
 
+from deepracer_exp.analysis.evidence import estimate
 from deepracer_exp.errors import BadInput
 
 CONFIDENCE = 0.95
@@ -101,6 +102,26 @@ def interval_text(figure: dict[str, Any], show: Callable[[float | None], str]) -
     """Return what `mean_and_interval` found, for a table."""
     mean, *ends = map(show, (figure["mean"], *(figure["interval"] or ())))
     return f"{mean} ({' to '.join(ends)})" if ends else mean
+
+
+def over_seeds(values: Sequence[float | None]) -> dict[str, Any]:
+    """Return `seeds`, the values, and their `iqm` (interquartile mean) with its bootstrap `interval`, for JSON.
+
+    None is longer than any number; so is null in the mean and the interval.
+    """
+    found = estimate([np.array([math.inf if value is None else value for value in values])])
+    ends = None if found.interval is None else [_finite(end) for end in found.interval]
+    return {"seeds": list(values), "iqm": _finite(found.iqm), "interval": ends}
+
+
+def iqm_text(figure: dict[str, Any], show: Callable[[float | None], str]) -> str:
+    """Return what `over_seeds` found, for a table."""
+    middle, *ends = map(show, (figure["iqm"], *(figure["interval"] or ())))
+    return f"{middle} ({' to '.join(ends)})" if ends else middle
+
+
+def _finite(value: float) -> float | None:
+    return round(value, 4) if math.isfinite(value) else None
 
 
 def machine() -> dict[str, Any]:

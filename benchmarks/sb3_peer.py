@@ -34,7 +34,7 @@ from deepracer_exp.sim.batch import cores
 
 from .report import benchmark_parser
 
-_ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "elu": torch.nn.ELU, "silu": torch.nn.SiLU}
+ACTIVATIONS = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "elu": torch.nn.ELU, "silu": torch.nn.SiLU}
 
 
 class Convolutions(BaseFeaturesExtractor):
@@ -45,12 +45,12 @@ class Convolutions(BaseFeaturesExtractor):
         channels, height, width = observation_space.shape
         layers: list[torch.nn.Module] = []
         for filters, kernel, stride in zip(network.filters, network.kernels, network.strides, strict=True):
-            layers += [torch.nn.Conv2d(channels, filters, kernel, stride), _ACTIVATIONS[network.activation]()]
+            layers += [torch.nn.Conv2d(channels, filters, kernel, stride), ACTIVATIONS[network.activation]()]
             channels = filters
         units = channels * math.prod(network.outputs(height, width))
         layers.append(torch.nn.Flatten())
         for hidden in network.hidden:
-            layers += [torch.nn.Linear(units, hidden), _ACTIVATIONS[network.activation]()]
+            layers += [torch.nn.Linear(units, hidden), ACTIVATIONS[network.activation]()]
             units = hidden
         self.layers = torch.nn.Sequential(*layers)
 
@@ -68,7 +68,7 @@ def build(experiment: Experiment, physics_threads: int, car_racing: bool = False
     layers: dict[str, Any]
     if isinstance(network, MLPConfig):
         sizes = {key: list(network.hidden) for key in ("pi", "vf")}
-        policy, layers = "MlpPolicy", {"net_arch": sizes, "activation_fn": _ACTIVATIONS[network.activation]}
+        policy, layers = "MlpPolicy", {"net_arch": sizes, "activation_fn": ACTIVATIONS[network.activation]}
     else:
         assert isinstance(network, CNNConfig)
         given = {"features_extractor_kwargs": {"network": network}}

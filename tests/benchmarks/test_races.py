@@ -8,14 +8,15 @@ from pathlib import Path
 import pytest
 
 from benchmarks import races
+from benchmarks.report import over_seeds
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.evaluation import EvaluationConfig
 from tests.conftest import Ended
 
 
 def test_a_seed_without_a_lap_is_slower_than_any() -> None:
-    assert races.over_seeds([8.0, None, 9.0, 8.5])["iqm"] == 8.75
-    lost = races.over_seeds([8.0, None, None, 8.5])
+    assert over_seeds([8.0, None, 9.0, 8.5])["iqm"] == 8.75
+    lost = over_seeds([8.0, None, None, 8.5])
     assert lost["iqm"] is None
     assert lost["interval"][1] is None
 

@@ -1,0 +1,82 @@
+"""The comparison of PPO, SAC and Stable-Baselines3's SAC asks each for the same, and takes figures from their runs."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from benchmarks import sac, sb3_sac
+from benchmarks.fresh import Driven
+from deepracer_exp.config.compose import compose_experiment
+from tests.conftest import Ended
+
+
+def test_compared_trainings_begin_one_after_the_other_and_differ_by_the_algorithm_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = []
+
+    def train(folder: Path, overrides: list[str], *minutes: float) -> dict[str, float | None]:
+        asked.append((folder.name, overrides))
+        seed = float(folder.name[-1])
+        return dict.fromkeys(sac.FIGURES, 1.0) | {"steps": 600.0, "train_s": 2.0, "lap_s": 5.0 + seed}
+
+    monkeypatch.setattr(sac, "ours", train)
+    monkeypatch.setattr(sac, "peer", train)
+    file = tmp_path / "sac.json"
+    words = ["--seeds", "2", "--tracks", "Oval_track", "--jobs", "1", "--runs-dir", str(tmp_path)]
+    assert sac.main([*words, "--json", str(file)]) == 0
+    first = [name for name, _ in asked[:5]]
+    assert first == [
+        *(f"Oval_track-continuous-{algorithm}-0" for algorithm in ("ppo", "sac", "sb3_sac")),
+        *(f"Oval_track-discrete_fast-{algorithm}-0" for algorithm in ("ppo", "sac")),
+    ]
+    assert asked[1][1] == asked[2][1]
+    assert set(asked[0][1]) ^ set(asked[1][1]) == {"algorithm=ppo", "algorithm=sac"}
+    rows = json.loads(file.read_text())["rows"]
+    assert len(asked) == 2 * len(rows)
+    assert rows[0]["lap_s"]["seeds"] == [5.0, 6.0]
+    assert rows[0]["steps_per_s"]["iqm"] == 300.0
+    assert "Oval_track, continuous, sb3_sac" in capsys.readouterr().out
+
+
+def test_a_run_is_reliable_at_its_first_row_with_enough_laps(
+    trained: Callable[..., Ended], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = trained("budget.iterations=1").folder
+    (row,) = trained("budget.iterations=1").metrics
+    shares = (None, 0.88, 0.9, 0.96)
+    rows = [row | {"lap_share": share, "env_steps": 100 * place} for place, share in enumerate(shares)]
+    laps = Driven(
+        completion=90.0, lap_share=0.5, lap_time_s=9.0, held_out_completion=0.0, held_out_lap_time_s=None
+    )
+    monkeypatch.setattr(sac, "read_metrics", lambda _: rows)
+    monkeypatch.setattr(sac, "drive", lambda *_: [laps])
+    found = sac.measure(run)
+    assert (found["reliable_steps"], found["lap_s"], found["lap_share"]) == (200, 9.0, 0.5)
+
+
+def test_the_peer_learns_as_often_as_ours_from_as_many_steps() -> None:
+    overrides = sac.Asked("Oval_track", "continuous", sac.PEER).overrides(1.0, ["collector.cars=64"])
+    experiment = compose_experiment(overrides)[0]
+    peer = sb3_sac.build(experiment, sb3_sac.Watch(10.0))
+    assert (peer.train_freq.frequency, peer.n_envs) == (64, 64)
+    assert peer.gradient_steps == 64
+    assert (peer.batch_size, peer.tau, peer.target_entropy) == (512, 0.05, -2.0)
+    assert peer.replay_buffer.buffer_size * peer.n_envs <= experiment.algorithm.replay_steps
+    peer.env.close()
+
+
+def test_the_peer_trains_for_its_seconds_and_drives_laps() -> None:
+    overrides = sac.Asked("Oval_track", "continuous", sac.PEER).overrides(1.0, ["collector.cars=64"])
+    found = sb3_sac.measure(compose_experiment(overrides)[0], seconds=1.0, trials=2)
+    assert found["steps"] > 0
+    assert found["train_s"] >= 1.0
+    assert found["reliable_s"] is None
+    assert 0 <= found["lap_share"] <= 1
+
+
+def test_no_time_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert sac.main(["--minutes", "0"]) == 2
+    assert capsys.readouterr().err.startswith("--minutes 0: ")
