@@ -19,7 +19,7 @@ OPEN_MAPPINGS = ("reward.constants", *(f"{group}.kwargs" for group in GROUPS))
 PLAIN_TEXT = (
     *("track.file", "reward.file", "action_space.file", "custom_files", "runs_dir", "tracking.uri"),
     # Of commands that read runs; the number of an iteration has leading zeros.
-    "checkpoint",
+    *("checkpoint", "rival", "rival_checkpoint", "race.rivals.policy", "race.rivals.checkpoint"),
     # Of sweeps.
     *("study", "parent", "sweep.storage"),
 )

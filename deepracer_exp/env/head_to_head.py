@@ -58,7 +58,7 @@ class Rivals:
     """Everything that rivals need in another process; picklable."""
 
     setup: RaceSetup
-    """Of `rival_setup`."""
+    """The rivals' race, of `rival_setup`."""
     policy: torch.nn.Module
     """The layers; their weights do not count."""
     weights: tuple[Weights, ...]

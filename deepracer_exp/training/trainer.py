@@ -247,8 +247,6 @@ class Trainer:
                 collector.publish_policy()
                 update_s = time.monotonic() - began
                 self.iteration += 1
-                if self.rivals is not None and self.rivals.take(self.iteration):
-                    collector.publish_rivals(self.rivals.driving)
 
                 # 3. Measure: one row of metrics, the steps of the trace.
                 self.row = self._measure(finished, update, batch.numel(), collect_s, update_s)
@@ -259,6 +257,9 @@ class Trainer:
                 is_best = self.best.evaluated_best(self.evaluation, self.counters())
                 self._trace.write(self.iteration, to_table(rows, self.iteration, self.metrics.track_names))
                 self._check_interruption()
+                # After the evaluation, which thus raced against those that the policy has learned to beat.
+                if self.rivals is not None and self.rivals.take(self.iteration):
+                    collector.publish_rivals(self.rivals.driving)
 
                 # 5. Save when due and at the end.
                 if self.ending or self._save_requested or self._is_time_to_save():

@@ -12,9 +12,10 @@ from deepracer_exp.agents.schedules import PresetSchedule
 from deepracer_exp.config.compose import Composition, compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.options import conf_dir, groups, options
+from deepracer_exp.env.head_to_head import HeadToHead, rival_setup
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.env.race import Race
-from deepracer_exp.env.setup import build_setup
+from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.training.budget import Budget
 
 FILES = [(path.parent.name, path.stem) for group in groups() for path in (conf_dir() / group).glob("*.yaml")]
@@ -77,10 +78,19 @@ def test_every_experiment_is_named_after_its_file(name):
     assert composed("experiment", name)[0].name == name
 
 
+def race_with_rivals(setup: RaceSetup) -> Race:
+    """Put two cars on the road, and where the race is head to head a rival of each that drives straight ahead."""
+    if setup.others is None or setup.others.rivals is None:
+        return Race(setup, 2)
+    race = HeadToHead(setup, 2, rival_setup(setup, setup.observation))
+    race.drive_with([lambda seen: seen.set("action", torch.zeros(*seen.batch_size, 2))])
+    return race
+
+
 @pytest.mark.parametrize(("group", "name"), [(g, n) for g, n in EVERY_OPTION if g in (*DRIVEN, "experiment")])
 def test_every_option_puts_cars_on_the_road(group, name):
     experiment, _ = composed(group, name)
-    race = Race(build_setup(experiment), 2)
+    race = race_with_rivals(build_setup(experiment))
     race.reset()
     n_actions = race.setup.actions.n
     for _ in range(4):

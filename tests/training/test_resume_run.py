@@ -64,6 +64,10 @@ def whole(trained, *overrides):
             "algorithm.frames_per_iteration=256",
         ),
         ("observation=lidar", "randomization=sim2real"),
+        (
+            *("race=head_to_head", "observation.next_objects=1", "race.rivals.policy=pool"),
+            *("race.rivals.snapshot_every=1", "race.rivals.pool_size=3"),
+        ),
     ],
     ids=lambda overrides: " ".join(overrides) or "as it is",
 )

@@ -1,0 +1,229 @@
+"""Races of two: where both start, what each sees of the other, who is at fault, and that a state restores all of it."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDictBase
+
+from deepracer_exp.api import compose, make_env
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.env.gym_env import DeepRacerEnv
+from deepracer_exp.env.head_to_head import HeadToHead, Rivals, rival_setup, weights_of
+from deepracer_exp.env.setup import build_setup
+from deepracer_exp.env.trace import EPISODE_STATUS, PACKED
+from deepracer_exp.sim.others import CAR_M
+from tests.conftest import refused
+
+from .conftest import make_setup
+
+RACE = (
+    *("race=head_to_head", "observation.next_objects=1", "track=reInvent2019_track"),
+    *("action_space=continuous", "action_space.speed.low=0", "episode.immobilized_steps=0"),
+)
+GO, STOP, SLOWLY = np.array([0.0, 1.0]), np.array([0.0, -1.0]), np.array([0.0, -0.6])
+
+
+class Always(torch.nn.Module):
+    """A policy that takes one action whatever it sees."""
+
+    def __init__(self, action: np.ndarray = STOP):
+        super().__init__()
+        self.action = torch.nn.Parameter(torch.from_numpy(action).float())
+
+    def forward(self, seen: TensorDictBase) -> TensorDictBase:
+        return seen.set("action", self.action.expand(*seen.batch_size, -1))
+
+
+@pytest.fixture
+def duel() -> Callable[..., HeadToHead]:
+    """Build a race of n learners whose rivals take an action."""
+
+    def build(*overrides: str, n_cars: int = 1, rival: np.ndarray = STOP, **options) -> HeadToHead:
+        setup = make_setup(*RACE, *overrides)
+        race = HeadToHead(setup, n_cars, rival_setup(setup, setup.observation), **options)
+        race.drive_with([Always(rival)])
+        race.reset()
+        return race
+
+    return build
+
+
+def put(race, distance_m: float, offset_m: float = 0.0) -> None:
+    """Put all cars' origins at a distance along the centre line, to the left of it."""
+    track = race.setup.track
+    pose = track.start_pose(np.full(race.n_cars, distance_m / track.length_m))
+    x, y = pose.x - offset_m * np.sin(pose.yaw_rad), pose.y + offset_m * np.cos(pose.yaw_rad)
+    race._batch.place(race._everyone, x, y, pose.yaw_rad)
+    race.rules.measure(race._batch.read())
+
+
+def meet(race: HeadToHead, mine_m: float, theirs_m: float, theirs_offset_m: float = 0.0) -> None:
+    """Put learners and rivals on the road, past their prepare step."""
+    race.step(np.tile(STOP, (race.n_cars, 1)))
+    put(race, mine_m)
+    put(race.rival, theirs_m, theirs_offset_m)
+    race._meet(race._everyone)
+    for one in (race, race.rival):
+        one.rules.start_midway(np.full(race.n_cars, 10), 100 * one.rules.now.ndist)
+
+
+def status(race) -> list[str]:
+    return [EPISODE_STATUS[int(code)] for code in race.trace[:, PACKED["episode_status"]]]
+
+
+def test_one_car_starts_behind_the_other_in_the_other_lane_and_both_places_occur(duel):
+    race = duel("episode.start_advance=0", "episode.start_offset=0.3", n_cars=40)
+    track = race.setup.track
+    gap_m = race.others.others.distance_m[:, 0] - race.rival.others.others.distance_m[:, 0]
+    assert 8 < (gap_m > 0).sum() < 32
+    np.testing.assert_allclose(np.abs(gap_m), 0.75, atol=0.15)
+    sides = np.sign(race.others.others.offset_m[:, 0]), np.sign(race.rival.others.others.offset_m[:, 0])
+    assert (sides[0] == -sides[1]).all()
+    # Whoever is in front is in the outer lane.
+    outer = -1 if not track.is_clockwise else 1
+    assert (np.where(gap_m > 0, sides[0], sides[1]) == outer).all()
+    race.step(np.tile(STOP, (40, 1)))
+    behind = gap_m > 0
+    assert (race.trace[behind, PACKED["progress"]] < 0).all()
+    assert (race.trace[~behind, PACKED["progress"]] >= 0).all()
+
+
+def test_each_car_sees_where_the_other_is_now(duel):
+    race = duel(n_cars=4, rival=np.array([0.2, 0.5]))
+    for _ in range(25):
+        race.step(np.tile([-0.1, 0.2], (4, 1)))
+        for one, other in ((race, race.rival), (race.rival, race)):
+            now, shown = other.rules.now, one.others.others
+            np.testing.assert_array_equal(shown.poses[:, 0], np.stack([now.x_m, now.y_m, now.yaw_rad], 1))
+            np.testing.assert_array_equal(shown.speeds_mps(None)[:, 0], now.speed_mps)
+    at = race.feature_names.index("next_1_closing")
+    scale = race.setup.observation.speed_scale_mps
+    ahead = race.observation[:, at - 2] < 1
+    assert ahead.any()
+    closing = (race.rules.now.speed_mps - race.rival.rules.now.speed_mps) / scale
+    np.testing.assert_allclose(race.observation[ahead, at], closing[ahead], rtol=1e-5)
+
+
+@pytest.mark.parametrize("learner_is_behind", [True, False])
+def test_who_runs_into_the_other_from_behind_is_at_fault_and_the_other_drives_on(duel, learner_is_behind):
+    race = duel(rival=STOP if learner_is_behind else GO)
+    gap_m = 0.6 if learner_is_behind else -0.6
+    meet(race, 3.0, 3.0 + gap_m)
+    for _ in range(20):
+        race.step(np.array([GO if learner_is_behind else STOP]))
+        if {"crashed"} & {*status(race), *status(race.rival)}:
+            break
+    hit, innocent = (race, race.rival) if learner_is_behind else (race.rival, race)
+    assert status(hit) == ["crashed"]
+    assert status(innocent) == ["in_progress"]
+    assert race.terminated.tolist() == [learner_is_behind]
+
+
+def test_a_rival_that_has_crashed_stands_for_its_pause_and_cannot_be_run_into(duel):
+    race = duel("race.rivals.pause_s=1", rival=GO)
+    meet(race, 3.0, 3.0 - 0.6)
+    seen, stood_at = [], []
+    for _ in range(40):
+        race.step(np.array([STOP]))
+        seen += status(race.rival)
+        stood_at.append(race.rival.rules.now.x_m[0])
+        assert status(race) == ["in_progress"]
+        if "pause" in seen and seen[-1] != "pause":
+            break
+    first = seen.index("pause")
+    assert seen[first - 1] == "crashed"
+    assert seen.count("pause") == 15
+    assert len(set(stood_at[first : first + 14])) == 1
+    # It stands in the learner, who could not but run into it.
+    away_m = np.hypot(
+        race.rules.now.x_m - race.rival.rules.now.x_m, race.rules.now.y_m - race.rival.rules.now.y_m
+    )
+    assert away_m < CAR_M[0] + 1.0
+
+
+def test_across_the_start_line_the_car_ahead_is_the_one_ahead_unless_as_on_the_service(duel):
+    for quirks, at_fault in (("fixed", True), ("service", False)):
+        race = duel(f"race.quirks={quirks}")
+        # The front of the learner is before the line, that of the rival past it.
+        meet(race, race.setup.track.length_m - 0.35, 0.0 - 0.05)
+        race.step(np.array([STOP]))
+        assert (status(race) == ["crashed"]) is at_fault, quirks
+
+
+def test_a_rival_that_leaves_the_track_goes_on_from_where_it_left_and_the_learner_s_episode_goes_on(duel):
+    race = duel(rival=np.array([1.0, 0.5]))
+    seen = []
+    for _ in range(60):
+        race.step(np.array([STOP]))
+        seen += status(race.rival)
+        assert not race.terminated.any()
+    assert "off_track" in seen
+    assert seen[seen.index("off_track") + 1] == "pause"
+
+
+def test_learner_and_rival_meet_the_same_conditions(duel):
+    race = duel("randomization=sim2real", n_cars=6)
+    np.testing.assert_array_equal(race.randomization.values, race.rival.randomization.values)
+
+
+def test_each_episode_draws_its_rival_among_all(duel):
+    race = duel(n_cars=64)
+    race.drive_with([Always(STOP), Always(SLOWLY)])
+    for _ in range(10):
+        race.step(np.tile(STOP, (64, 1)))
+    moved = race.rival.rules.now.speed_mps > 0.2
+    assert 16 < moved.sum() < 48
+    race.reset()
+    for _ in range(10):
+        race.step(np.tile(STOP, (64, 1)))
+    assert (moved != (race.rival.rules.now.speed_mps > 0.2)).any()
+
+
+def test_a_restored_race_continues_bit_for_bit(duel):
+    def roll(race, steps):
+        rows = []
+        for action in np.random.default_rng(steps).uniform(-0.3, 0.4, (steps, 8, 2)):
+            race.step(action)
+            rows.append(np.concatenate([race.trace, race.rival.trace, race.observation], axis=1))
+            race.reset(np.flatnonzero(race.terminated | race.truncated))
+        return np.array(rows)
+
+    def build():
+        race = duel("randomization=sim2real", n_cars=8, rival=np.array([0.1, 0.1]))
+        race.drive_with([Always(np.array([0.1, 0.1])), Always(np.array([-0.1, 0.3]))])
+        return race
+
+    race = build()
+    roll(race, 50)
+    state = race.state_dict()
+    wanted = roll(race, 40)
+    again = build()
+    again.load_state_dict(state)
+    np.testing.assert_array_equal(roll(again, 40), wanted)
+
+
+def test_weights_survive_the_way_to_another_process():
+    first, second = Always(GO), Always(STOP)
+    setup = make_setup(*RACE)
+    rivals = Rivals(setup=rival_setup(setup, setup.observation), policy=first, weights=(weights_of(second),))
+    (built,) = rivals.policies(rivals.weights)
+    assert built.action.tolist() == STOP.tolist()
+    assert first.action.tolist() == GO.tolist()
+
+
+def test_environments_without_anybody_to_drive_the_rival_are_refused():
+    assert "race.rivals.policy=newest" in refused(make_env, compose(*RACE))
+    assert "race.rivals.policy=newest" in refused(DeepRacerEnv, RACE)
+
+
+def test_a_rival_needs_a_closed_track_and_an_empty_road(tmp_path):
+    file = tmp_path / "straight.yaml"
+    file.write_text("closed: false\nwidth_m: 1.0\nknots: [[0, 0], [1, 0], [2, 0.2], [3, 0], [4, 0]]\n")
+    open_track = compose_experiment([*RACE[:2], f"track.file={file}"])[0]
+    assert "no room behind its start" in refused(build_setup, open_track)
+    assert "without boxes and bots" in refused(compose_experiment, [*RACE, "race.boxes.number=2"])
+    assert "next_objects=0" in refused(compose_experiment, ["race=head_to_head"])
+    line = refused(compose_experiment, [*RACE, "race.rivals.checkpoint=last"])
+    assert "checkpoint=last" in line
