@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDict
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torch.distributions import Categorical
 
 from deepracer_exp.config.driving import ObservationConfig, RandomizationConfig
 from deepracer_exp.rewards.prints import RewardPrints
@@ -221,12 +221,11 @@ class HeadToHead(Race):
         policies, seen = self._policies, self.rival.seen
         which = (self._share * len(policies)).astype(np.intp)
         actions: np.ndarray | None = None
-        # The training's own actions are drawn; those of rivals are the likeliest.
-        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        with torch.no_grad():
             for number in np.unique(which).tolist():
                 rows = np.flatnonzero(which == number)
                 read = {key: torch.from_numpy(values[rows]) for key, values in seen.items()}
-                acted = policies[number](TensorDict(read, [len(rows)]))["action"].numpy()
+                acted = _likeliest(policies[number], TensorDict(read, [len(rows)])).numpy()
                 if actions is None:
                     actions = np.empty((self.n_cars, *acted.shape[1:]), acted.dtype)
                 actions[rows] = acted
@@ -247,3 +246,16 @@ class HeadToHead(Race):
         self._rival_percent = np.where(
             on_track, np.where(status == _LAP, 0.0, row[:, _PROGRESS]), self._rival_percent
         )
+
+
+def _likeliest(policy: torch.nn.Module, seen: TensorDict) -> torch.Tensor:
+    """Return the policy's likeliest actions, of a continuous one the means; what is not drawn from has one anyway."""
+    get_dist = getattr(policy, "get_dist", None)
+    if get_dist is None:
+        return policy(seen)["action"]
+    # Calling the policy would compute log-probabilities as well, which takes as long as the rest.
+    distribution = get_dist(seen)
+    mode: torch.Tensor = (
+        distribution.mode if isinstance(distribution, Categorical) else distribution.deterministic_sample
+    )
+    return mode

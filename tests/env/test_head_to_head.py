@@ -5,12 +5,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from deepracer_exp.agents.build import build_networks
 from deepracer_exp.api import compose, make_env
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.gym_env import DeepRacerEnv
 from deepracer_exp.env.head_to_head import HeadToHead, Rivals, rival_setup, weights_of
+from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.env.trace import EPISODE_STATUS, PACKED
 from deepracer_exp.sim.others import CAR_M
@@ -179,6 +182,20 @@ def test_each_episode_draws_its_rival_among_all(duel):
     for _ in range(10):
         race.step(np.tile(STOP, (64, 1)))
     assert (moved != (race.rival.rules.now.speed_mps > 0.2)).any()
+
+
+@pytest.mark.parametrize("overrides", [(), ("action_space=discrete",), ("algorithm=sac",)], ids=" ".join)
+def test_a_rival_takes_the_actions_of_an_evaluation(overrides):
+    config = compose_experiment([*RACE[:3], *overrides])[0]
+    setup = build_setup(config)
+    shape, generator = observation_shape(config.observation), torch.Generator().manual_seed(3)
+    policy = build_networks(config.network, config.algorithm, shape, setup.actions.n, generator).policy
+    race = HeadToHead(setup, 8, rival_setup(setup, config.observation))
+    race.drive_with([policy])
+    race.reset()
+    seen = TensorDict({"observation": torch.from_numpy(race.rival.observation)}, [8])
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        np.testing.assert_array_equal(race._rivals_actions(), policy(seen)["action"].numpy())
 
 
 def test_a_restored_race_continues_bit_for_bit(duel):
