@@ -239,5 +239,5 @@ def _moved(lap: int, x: str, y: str, xs: ArrayLike, ys: ArrayLike, color: str) -
     """Return a point at the beginning of a lap; `x` and `y` name the values that move it."""
     layer = points(np.asarray(xs)[:1], np.asarray(ys)[:1], color, size=12)
     layer.update(meta={"lap": lap, "x": x, "y": y}, hoverinfo="skip")
-    layer.marker.update(opacity=1.0, line={"width": 1.5, "color": PAPER})
+    layer["marker"].update(opacity=1.0, line={"width": 1.5, "color": PAPER})
     return layer

@@ -11,13 +11,13 @@ from importlib.resources import files
 from typing import Any
 
 import jinja2
+import numpy as np
 from markupsafe import Markup
-from plotly.graph_objects import Figure
+from numpy.typing import NDArray
 from plotly.offline import get_plotlyjs
-from plotly.utils import PlotlyJSONEncoder
 
 from deepracer_exp.analysis.charts.figure import Chart
-from deepracer_exp.analysis.charts.layout import draw
+from deepracer_exp.analysis.charts.layout import Figure, draw
 from deepracer_exp.analysis.charts.style import DARK, NARROW_WIDTH
 
 
@@ -56,13 +56,27 @@ def png_uri(png: bytes) -> str:
 
 def plot(figure: Figure, name: str, title: str, narrow: Figure, least_width: int = 0) -> Plot:
     """Pack a figure, whose layout has a height; `narrow` holds the same traces, laid out for a narrow screen."""
-    whole = figure.to_plotly_json()
-    layout = narrow.layout.to_plotly_json()
-    whole["narrow"] = {key: value for key, value in layout.items() if value != whole["layout"].get(key)}
-    text = json.dumps(whole, cls=PlotlyJSONEncoder, separators=(",", ":"))
-    return Plot(
-        name, title, int(figure.layout.height), int(narrow.layout.height), least_width, gzip_base64(text)
-    )
+    desk, phone = figure["layout"], narrow["layout"]
+    changed = {key: value for key, value in phone.items() if value != desk.get(key)}
+    text = figure_json(figure | {"narrow": changed})
+    return Plot(name, title, int(desk["height"]), int(phone["height"]), least_width, gzip_base64(text))
+
+
+def figure_json(figure: Figure) -> str:
+    """Return a figure as JSON, with arrays of numbers as plotly.js reads them fastest: their bytes in base64.
+
+    Raises:
+        ValueError: a number outside an array is not finite.
+    """
+    return json.dumps(figure, default=_array, allow_nan=False, separators=(",", ":"))
+
+
+def _array(values: NDArray[np.float32]) -> dict[str, str] | list[float]:
+    # plotly.js does not draw an empty array of bytes.
+    if not values.size:
+        return values.tolist()
+    data = base64.b64encode(values.astype("<f4").tobytes()).decode("ascii")
+    return {"dtype": "f4", "bdata": data, "shape": ",".join(map(str, values.shape))}
 
 
 def plot_of(chart: Chart) -> Plot:

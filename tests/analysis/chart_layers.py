@@ -4,7 +4,9 @@ from typing import Any
 
 import plotly.graph_objects as go
 
-from deepracer_exp.analysis.charts.figure import Chart, Panel
+from deepracer_exp.analysis.charts.figure import Annotation, Chart, Layer, Panel, Shape
+from deepracer_exp.analysis.charts.layout import draw
+from deepracer_exp.analysis.charts.style import WIDTH
 
 KINDS = {
     "line": lambda one: isinstance(one, go.Scatter) and one.mode.startswith("lines") and one.fill is None,
@@ -16,8 +18,24 @@ KINDS = {
 }
 
 
+def as_plotly(layer: Layer) -> Any:
+    """Return a layer as Plotly's own object, which refuses what plotly.js would pass over."""
+    if isinstance(layer, Annotation):
+        return go.layout.Annotation(layer)
+    if isinstance(layer, Shape):
+        return go.layout.Shape(layer)
+    kinds = {"scatter": go.Scatter, "bar": go.Bar, "heatmap": go.Heatmap}
+    return kinds[layer["type"]]({key: value for key, value in layer.items() if key != "type"})
+
+
+def drawn(chart: Chart, width: float = WIDTH) -> go.Figure:
+    """Return a chart drawn, as Plotly's own object."""
+    return go.Figure(draw(chart, width))
+
+
 def layers(chart: Chart | Panel | None, kind: str) -> list[Any]:
-    """Return the layers of one kind of a chart or of a panel, in order."""
+    """Return the layers of one kind of a chart or of a panel, in order, as Plotly's own objects."""
     assert chart is not None
     panels = [chart] if isinstance(chart, Panel) else [panel for row in chart.rows for panel in row]
-    return [layer for panel in panels for layer in panel.layers if KINDS[kind](layer)]
+    objects = [as_plotly(layer) for panel in panels for layer in panel.layers]
+    return [layer for layer in objects if KINDS[kind](layer)]

@@ -26,7 +26,9 @@ from deepracer_exp.analysis.charts.layout import draw
 from deepracer_exp.analysis.charts.maps import map_panel
 from deepracer_exp.analysis.charts.style import BLUE, GREEN, NARROW_WIDTH, ORANGE, VERMILION
 from deepracer_exp.analysis.statistics import subsample
+from deepracer_exp.reports.page import figure_json
 
+from .chart_layers import as_plotly, drawn
 from .made_up import made_up_course
 
 X = np.arange(20.0)
@@ -51,9 +53,9 @@ def chart(*rows: list[Panel], share_x: bool = False) -> Chart:
 
 @pytest.mark.parametrize("kind", LAYERS)
 def test_every_kind_of_layer_is_drawn_once_on_the_axes_of_its_panel(kind: str) -> None:
-    figure = draw(chart([Panel(layers=[]), Panel(layers=[LAYERS[kind]])]))
-    (drawn,) = [*figure.data, *figure.layout.shapes, *figure.layout.annotations]
-    axes = (drawn.xaxis, drawn.yaxis) if figure.data else (drawn.xref, drawn.yref)
+    figure = drawn(chart([Panel(layers=[]), Panel(layers=[LAYERS[kind]])]))
+    (layer,) = [*figure.data, *figure.layout.shapes, *figure.layout.annotations]
+    axes = (layer.xaxis, layer.yaxis) if figure.data else (layer.xref, layer.yref)
     assert [axis.split()[0] for axis in axes] == ["x2", "y2"]
 
 
@@ -67,14 +69,14 @@ def test_the_table_holds_all_that_is_drawn() -> None:
 @pytest.mark.parametrize("counts", [(1,), (2,), (3, 2), (2, 1, 2)])
 def test_every_panel_is_drawn(counts: tuple[int, ...]) -> None:
     rows = [[Panel(title=f"{count} {n}", layers=[LAYERS["line"]]) for n in range(count)] for count in counts]
-    figure = draw(chart(*rows))
+    figure = drawn(chart(*rows))
     assert {trace.xaxis for trace in figure.data} == {"x", *(f"x{n}" for n in range(2, sum(counts) + 1))}
     assert len(figure.layout.annotations) == sum(counts)
 
 
 def test_on_a_phone_the_same_traces_are_in_panels_below_each_other() -> None:
     two = chart([Panel(layers=[LAYERS["cells"]]), Panel(layers=[LAYERS["line"], LAYERS["coloured points"]])])
-    desk, phone = draw(two), draw(two, NARROW_WIDTH)
+    desk, phone = drawn(two), drawn(two, NARROW_WIDTH)
     assert [trace.to_json() for trace in desk.data] == [trace.to_json() for trace in phone.data]
     assert phone.layout.yaxis2.domain[1] < phone.layout.yaxis.domain[0]
     assert desk.layout.yaxis2.domain == desk.layout.yaxis.domain
@@ -83,7 +85,7 @@ def test_on_a_phone_the_same_traces_are_in_panels_below_each_other() -> None:
 def test_legends_are_above_the_data_and_panels_do_not_overlap() -> None:
     names = [line(X, X + n, BLUE, f"a line with a long name, number {n}") for n in range(7)]
     panel = Panel(title="one", x_label="x", layers=[*names, *LAYERS.values()])
-    layout = draw(chart(*([panel] * 2 for _ in range(3)), share_x=True)).layout
+    layout = drawn(chart(*([panel] * 2 for _ in range(3)), share_x=True)).layout
     assert layout.legend.y > layout.yaxis.domain[1]
     assert layout.legend.orientation == "v"
     heights = [layout[f"yaxis{'' if n == 1 else n}"].domain for n in (1, 3, 5)]
@@ -95,10 +97,10 @@ def test_legends_are_above_the_data_and_panels_do_not_overlap() -> None:
 
 def test_maps_have_the_same_scale_along_both_axes_and_are_as_high_as_their_course() -> None:
     maps = [map_panel(made_up_course(name), []) for name in ("reinvent_base", "Straight_track")]
-    high, wide = (draw(chart([panel])) for panel in maps)
+    high, wide = (drawn(chart([panel])) for panel in maps)
     assert high.layout.yaxis.scaleanchor == "x"
     assert wide.layout.height < 0.8 * high.layout.height
-    road = maps[0].layers[0]
+    road = as_plotly(maps[0].layers[0])
     assert (road.path.count("M"), road.fillrule) == (2, "evenodd")  # the inside stays empty
     far = map_panel(made_up_course(), [points([100.0], [-50.0], BLUE)])
     assert far.x_range[1] > 100.0
@@ -107,18 +109,18 @@ def test_maps_have_the_same_scale_along_both_axes_and_are_as_high_as_their_cours
 
 def test_a_band_is_interrupted_where_a_value_is_unknown() -> None:
     low = np.where(X == 9, np.nan, X)
-    trace = band(X, low, low + 1, BLUE)
+    trace = as_plotly(band(X, low, low + 1, BLUE))
     gaps = np.flatnonzero(np.isnan(trace.x))
     assert len(gaps) == 1
     first = np.column_stack([trace.x[: gaps[0]], trace.y[: gaps[0]]])
     assert Path(first).contains_point((5.0, 5.5))
     assert first[:, 0].max() == 8.0
-    assert len(band(X, X * np.nan, X, BLUE).x) == 0
+    assert len(band(X, X * np.nan, X, BLUE)["x"]) == 0
 
 
 def test_numbers_are_stored_in_half_precision_and_not_as_text() -> None:
     many = points(np.arange(3000.0) / 7, np.arange(3000.0) / 3, BLUE)
-    text = draw(chart([Panel(layers=[many])])).to_json()
+    text = figure_json(draw(chart([Panel(layers=[many])])))
     assert json.loads(text)["data"][0]["x"]["dtype"] == "f4"
     assert len(text) < 2 * 3000 * 4 * 4 / 3 + 8000
 
@@ -132,21 +134,21 @@ def test_text_is_not_interpreted_as_markup() -> None:
         colored_points(X, X, X, nasty),
     ]
     panel = Panel(title=nasty, x_label=nasty, x_names=[nasty], layers=layers)
-    figure = draw(Chart(name="one", title=nasty, caption="", rows=[[panel]])).to_json()
+    figure = drawn(Chart(name="one", title=nasty, caption="", rows=[[panel]])).to_json()
     text = figure.encode().decode("unicode_escape")
     assert nasty not in text
     assert text.count("&lt;b&gt;&amp;1&lt;/b&gt;") >= 8
 
 
 def test_names_along_an_axis_are_where_their_bars_are() -> None:
-    figure = draw(chart([Panel(layers=[bars([0, 1], [1.0, 2.0], BLUE)], x_names=["left", "right"])]))
+    figure = drawn(chart([Panel(layers=[bars([0, 1], [1.0, 2.0], BLUE)], x_names=["left", "right"])]))
     assert list(figure.layout.xaxis.tickvals) == list(figure.data[0].x)
     assert list(figure.layout.xaxis.ticktext) == ["left", "right"]
 
 
 def test_zero_is_in_the_middle_of_diverging_colours() -> None:
     cells = heatmap(X, X, np.outer(X, -X), "", diverging=True)
-    assert cells.zmin == -cells.zmax < 0
+    assert cells["zmin"] == -cells["zmax"] < 0
 
 
 @given(st.integers(0, 30000), st.integers(2, 5000))

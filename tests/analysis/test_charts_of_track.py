@@ -31,8 +31,9 @@ from deepracer_exp.analysis.findings import findings
 from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.off_track import risk_counts
 from deepracer_exp.analysis.racing_line import MARGIN_M, center_line, minimum_curvature_line
+from deepracer_exp.reports.page import figure_json
 
-from .chart_layers import layers
+from .chart_layers import drawn, layers
 from .made_up import Drive, made_up_course, made_up_recording
 
 MAPS = (
@@ -66,7 +67,7 @@ def test_every_chart_is_drawn_as_far_as_course_and_steps_are_known(
     assert chart.name == make.__name__
     assert chart.caption.count(". ") >= 1
     assert len(chart.table)
-    assert len(draw(chart).to_json()) < 1_000_000
+    assert len(figure_json(draw(chart))) < 1_000_000
     cells = layers(chart, "cells")
     assert all(layer.z.dtype == np.float32 for layer in cells)
     assert sum(layer.z.size for layer in cells) <= 60_000
@@ -74,7 +75,7 @@ def test_every_chart_is_drawn_as_far_as_course_and_steps_are_known(
     assert (lost is None) == (make in MAPS)
     if lost is not None:
         assert not any(panel.map for row in lost.rows for panel in row)
-        assert draw(lost).data
+        assert drawn(lost).data
     nothing = make(replace(view, steps=view.steps.iloc[:0], episodes=view.episodes.iloc[:0]))
     assert (nothing is None) == (make is not waypoint_map)
 
@@ -240,5 +241,5 @@ def test_terms_are_shown_with_their_sum(view: LogView) -> None:
     total, progress, off_road = layers(chart.rows[0][0], "line")
     for line, value in ((total, 1.0), (progress, 1.5), (off_road, -0.5)):
         np.testing.assert_allclose(line.y[np.isfinite(line.y)], value)
-    assert draw(chart).data
+    assert drawn(chart).data
     assert reward_terms(view, terms.iloc[:0]) is None

@@ -31,8 +31,9 @@ from deepracer_exp.analysis.charts.training import (
     training_progress,
 )
 from deepracer_exp.analysis.log_view import LogView, prepare
+from deepracer_exp.reports.page import figure_json
 
-from .chart_layers import layers
+from .chart_layers import drawn, layers
 from .made_up import Drive, made_up_course, made_up_recording
 
 OF_LAPS = (lap_time_histogram, lap_time_percentile, lap_delta, correlations)
@@ -85,7 +86,7 @@ def test_every_figure_has_labels_and_a_caption_and_is_drawn(
     assert all(panel.y_label for row in chart.rows for panel in row)
     assert chart.rows[-1][-1].x_label or chart.rows[-1][-1].x_names
     assert all(len(points.x) <= 5000 for points in layers(chart, "points"))
-    assert draw(chart).data
+    assert drawn(chart).data
 
 
 @pytest.mark.parametrize("figure", ALL)
@@ -94,7 +95,7 @@ def test_a_short_training_or_a_race_alone_breaks_no_figure(figure: Callable[[Log
     race = figure(prepare(made_up_recording([], evaluations={"race": [Drive()]})))
     assert (race is not None) == (figure in OF_RACES)  # a race has no iterations
     for chart in filter(None, (short, race)):
-        assert draw(chart).data
+        assert drawn(chart).data
 
 
 @pytest.mark.parametrize("figure", OF_LAPS)
@@ -239,4 +240,4 @@ def test_the_console_training_has_47_laps_the_best_of_14_13_s(console: LogView) 
     chart = lap_time_histogram(console)
     assert chart.rows[0][0].title == "All complete laps (47)"
     assert any(mark.name == "best 14.20 s" for mark in layers(chart, "mark"))
-    assert max(len(draw(figure(console)).to_json()) for figure in ALL) < 120_000
+    assert max(len(figure_json(draw(figure(console)))) for figure in ALL) < 120_000

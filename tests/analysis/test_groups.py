@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 
 from deepracer_exp.analysis.charts.groups import best_checkpoints, learning_curve_charts
-from deepracer_exp.analysis.charts.layout import draw
 from deepracer_exp.analysis.evidence import SAME, TOO_FEW, estimate
 from deepracer_exp.analysis.group_curves import curves_table, group_curve
 from deepracer_exp.analysis.group_tables import differences_table, groups_as_json, scored, sentences
 from deepracer_exp.analysis.groups import RunGroup, compared, group_runs
 from deepracer_exp.runs.files import RunRecord, read_record
 
-from .chart_layers import layers
+from .chart_layers import drawn, layers
 from .made_up_runs import made_up_run, made_up_seeds
 
 
@@ -119,7 +118,7 @@ def test_runs_without_a_lap_are_slower_than_any_and_those_without_a_result_are_l
     assert (lap.difference.iqm, lap.verdict) == (None, "slower")
     assert "1 run without an evaluation, or not ended: left out of the figures." in sentences(groups, [lap])
     chart = best_checkpoints(groups)
-    assert draw(chart).data
+    assert drawn(chart).data
 
 
 def test_different_conditions_are_said_to_be_different(tmp_path):
@@ -152,7 +151,7 @@ def test_curves_have_bands_over_seeds_and_gaps_where_no_lap_was_completed(two, t
     (chart,) = learning_curve_charts([none])
     titles = [panel.title for row in chart.rows for panel in row]
     assert titles == ["Completion of the evaluated policy", "Completion in training", "Return of an episode"]
-    assert draw(chart).data
+    assert drawn(chart).data
 
 
 def test_runs_on_several_tracks_at_once_have_the_mean_of_their_training_laps(tmp_path):

@@ -192,7 +192,7 @@ def test_the_chart_shows_evaluated_and_exploring_laps_apart() -> None:
     chart = training_progress(own(SLOWED_S))
     assert chart is not None
     (panel,) = (panel for row in chart.rows for panel in row if panel.title == "Lap times")
-    assert {"evaluated laps, mean", "exploring laps, mean"} <= {layer.name for layer in panel.layers}
+    assert {"evaluated laps, mean", "exploring laps, mean"} <= {layer.get("name") for layer in panel.layers}
 
 
 def test_nothing_is_said_of_a_table_without_laps() -> None:

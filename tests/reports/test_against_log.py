@@ -6,7 +6,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from deepracer_exp.analysis.charts.layout import draw
 from deepracer_exp.analysis.log_view import prepare_races
 from deepracer_exp.errors import BadInput
 from deepracer_exp.reports.against_log import (
@@ -17,6 +16,7 @@ from deepracer_exp.reports.against_log import (
     lines_compared,
     logged_laps,
 )
+from tests.analysis.chart_layers import drawn
 from tests.analysis.made_up import Drive, made_up_course, made_up_recording
 
 
@@ -90,7 +90,7 @@ def test_laps_driven_among_bots_say_that_the_simulated_car_is_alone(evaluations,
 def test_every_chart_is_drawn_however_far_the_laps_go(until):
     both = compared([Drive(), Drive(start=0.5)], [Drive(until=until)])
     for draw_one in (lines_compared, along_the_track, actions_compared):
-        assert draw(draw_one(both)).data
+        assert drawn(draw_one(both)).data
     assert all(sentence.endswith(".") for sentence in both.sentences)
     assert (both.stretch is None) == (until < 0.1)
     assert ("The simulated car completes no lap." in both.sentences) == (until < 1)

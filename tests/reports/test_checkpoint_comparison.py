@@ -8,7 +8,6 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from deepracer_exp.analysis.charts.layout import draw
 from deepracer_exp.analysis.charts.runs import speed_and_stability
 from deepracer_exp.evaluation.result import Evaluation
 from deepracer_exp.reports.checkpoint_comparison import (
@@ -18,6 +17,7 @@ from deepracer_exp.reports.checkpoint_comparison import (
     lap_statistics,
     recommend,
 )
+from tests.analysis.chart_layers import drawn
 from tests.evaluation.test_result import attempt, group
 
 
@@ -155,9 +155,9 @@ def row(
 )
 def test_every_checkpoint_is_in_the_legend_of_the_chart(rows):
     chart = speed_and_stability(pd.DataFrame(rows), str(rows[-1]["name"]))
-    assert draw(chart).data
+    assert drawn(chart).data
     panel = chart.rows[0][0]
-    named = [layer.name for layer in panel.layers if getattr(layer, "showlegend", False)]
+    named = [layer["name"] for layer in panel.layers if layer.get("showlegend")]
     assert all(any(name.startswith(str(one["name"])) for name in named) for one in rows)
     assert f"recommended: {rows[-1]['name']}" in named
     if any(one["complete"] for one in rows):

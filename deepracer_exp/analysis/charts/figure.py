@@ -1,4 +1,4 @@
-"""Charts made of panels, and the traces and shapes in these, as Plotly objects in one style."""
+"""Charts made of panels, and the traces and shapes in these, as plotly.js reads them, in one style."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,7 +6,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import pandas as pd
-import plotly.graph_objects as go
 from numpy.typing import ArrayLike, NDArray
 
 from .style import DIVERGING, INK, PAPER, SCALE, VEIL, escaped
@@ -14,8 +13,20 @@ from .style import DIVERGING, INK, PAPER, SCALE, VEIL, escaped
 _MANY = 500
 """Points from which on they are drawn half transparent."""
 
-Layer: TypeAlias = Any
-"""Plotly's Scatter, Bar, Heatmap, layout.Shape or layout.Annotation."""
+
+class Trace(dict[str, Any]):
+    """Points, bars or cells, by the keys of plotly.js; Plotly's own objects cost seconds a page."""
+
+
+class Shape(dict[str, Any]):
+    """A line or an area without data, by the keys of plotly.js."""
+
+
+class Annotation(dict[str, Any]):
+    """A text at a place, by the keys of plotly.js."""
+
+
+Layer: TypeAlias = Trace | Shape | Annotation
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -54,10 +65,10 @@ class Chart:
         """Return the data that is drawn, a row a point: `panel`, `name` in the legend, `x`, `y`, `value` by colour."""
         panels = [panel for row in self.rows for panel in row]
         tables = [
-            _data(layer).assign(panel=panel.title or panel.y_label, name=layer.name)
+            _data(layer).assign(panel=panel.title or panel.y_label, name=layer.get("name"))
             for panel in panels
             for layer in panel.layers
-            if isinstance(layer, go.Scatter | go.Bar | go.Heatmap)
+            if isinstance(layer, Trace)
         ]
         return pd.concat(tables, ignore_index=True)[["panel", "name", "x", "y", "value"]]
 
@@ -75,12 +86,14 @@ def line(
     *,
     width: float = 2.0,
     dashed: bool = False,
-) -> go.Scatter:
+) -> Trace:
     """Return a line through points; NaN interrupts it. Without a name it is not in the legend."""
     x, y = _light(x), _light(y)
     style = {"color": color, "width": width, "dash": "dash" if dashed else "solid"}
     # One or two points would be hard to see as a line.
-    return go.Scatter(x=x, y=y, mode="lines" if len(x) > 2 else "lines+markers", line=style, **_named(name))
+    return Trace(
+        type="scatter", x=x, y=y, mode="lines" if len(x) > 2 else "lines+markers", line=style, **_named(name)
+    )
 
 
 def points(
@@ -92,7 +105,7 @@ def points(
     size: float = 7.0,
     symbol: str = "circle",
     hover: Sequence[str] | None = None,
-) -> go.Scatter:
+) -> Trace:
     """Return points of one colour; `size` is their diameter in pixels."""
     x = _light(x)
     marker = {
@@ -101,7 +114,9 @@ def points(
         "color": color,
         "opacity": 0.45 if len(x) > _MANY else 0.9,
     }
-    return go.Scatter(x=x, y=_light(y), mode="markers", marker=marker, **_named(name), **_hover(hover))
+    return Trace(
+        type="scatter", x=x, y=_light(y), mode="markers", marker=marker, **_named(name), **_hover(hover)
+    )
 
 
 def colored_points(
@@ -113,7 +128,7 @@ def colored_points(
     size: float = 8.5,
     value_range: tuple[float, float] | None = None,
     hover: Sequence[str] | None = None,
-) -> go.Scatter:
+) -> Trace:
     """Return points coloured by values.
 
     `scale` is what the values are, with unit; `value_range` are those of the first and the last colour, without it
@@ -125,10 +140,12 @@ def colored_points(
     text = {"hovertemplate": f"%{{marker.color:.6~g}}<extra>{escaped(scale)}</extra>"}
     if hover is not None:
         text = _hover(hover)
-    return go.Scatter(x=_light(x), y=_light(y), mode="markers", marker=marker, showlegend=False, **text)
+    return Trace(
+        type="scatter", x=_light(x), y=_light(y), mode="markers", marker=marker, showlegend=False, **text
+    )
 
 
-def band(x: ArrayLike, low: ArrayLike, high: ArrayLike, color: str, name: str | None = None) -> go.Scatter:
+def band(x: ArrayLike, low: ArrayLike, high: ArrayLike, color: str, name: str | None = None) -> Trace:
     """Return the area between two lines; NaN interrupts it."""
     x, low, high = (np.asarray(values, np.float64) for values in (x, low, high))
     finite = np.isfinite(x) & np.isfinite(low) & np.isfinite(high)
@@ -139,7 +156,8 @@ def band(x: ArrayLike, low: ArrayLike, high: ArrayLike, color: str, name: str | 
         around += [there, back, np.full((1, 2), np.nan)]
     outline = np.concatenate([*around, np.zeros((0, 2))])
     red, green, blue = (int(color[begin : begin + 2], 16) for begin in (1, 3, 5))
-    return go.Scatter(
+    return Trace(
+        type="scatter",
         x=_light(outline[:-1, 0]),
         y=_light(outline[:-1, 1]),
         mode="lines",
@@ -159,14 +177,14 @@ def bars(
     *,
     base: ArrayLike | None = None,
     width: float | None = None,
-) -> go.Bar:
+) -> Trace:
     """Return bars from `base` upwards, so wide in units of x; without a width they almost touch."""
     x = _light(x)
     apart = np.diff(np.unique(x))
     width = width or (0.82 * float(apart.min()) if len(apart) else 0.82)
     marker = {"color": color, "line": {"width": 0.5, "color": PAPER}}
     base = None if base is None else _light(base)
-    return go.Bar(x=x, y=_light(height), base=base, width=width, marker=marker, **_named(name))
+    return Trace(type="bar", x=x, y=_light(height), base=base, width=width, marker=marker, **_named(name))
 
 
 def heatmap(
@@ -178,7 +196,7 @@ def heatmap(
     written: bool = False,
     diverging: bool = False,
     value_range: tuple[float, float] | None = None,
-) -> go.Heatmap:
+) -> Trace:
     """Return cells (m, n) coloured by values, with centres x (n,) and y (m,); NaN leaves a cell empty.
 
     `written` writes each value into its cell, `diverging` puts zero in the middle of the colours; `scale` and
@@ -187,7 +205,8 @@ def heatmap(
     low, high = value_range or color_range(values)
     if diverging:
         low, high = -max(abs(low), abs(high)), max(abs(low), abs(high))
-    return go.Heatmap(
+    return Trace(
+        type="heatmap",
         x=_light(x),
         y=_light(y),
         z=_light(values),
@@ -201,16 +220,14 @@ def heatmap(
     )
 
 
-def mark(
-    at: float, label: str, color: str, *, horizontal: bool = False, in_legend: bool = False
-) -> go.layout.Shape:
+def mark(at: float, label: str, color: str, *, horizontal: bool = False, in_legend: bool = False) -> Shape:
     """Return a dashed line across the panel, labelled at its end or in the legend; an empty label: the line alone."""
     ends = {"xref": "x domain", "x0": 0, "x1": 1, "yref": "y", "y0": at, "y1": at}
     text = {"text": escaped(label), "textposition": "end", "font": {"size": 12, "color": INK}}
     if not horizontal:
         ends = {"xref": "x", "x0": at, "x1": at, "yref": "y domain", "y0": 0, "y1": 1}
         text |= {"xanchor": "right", "yanchor": "top"}  # below the upper end, to the right of the line
-    return go.layout.Shape(
+    return Shape(
         type="line",
         line={"color": color, "width": 1.8, "dash": "dash"},
         name=escaped(label),
@@ -220,19 +237,20 @@ def mark(
     )
 
 
-def note(place: Sequence[float], text: str) -> go.layout.Annotation:
+def note(place: Sequence[float], text: str) -> Annotation:
     """Return a text at a place (2,)."""
     where = {"x": place[0], "y": place[1], "xref": "x", "yref": "y"}
     font = {"size": 12, "color": INK}
-    return go.layout.Annotation(text=escaped(text), showarrow=False, bgcolor=VEIL, font=font, **where)
+    return Annotation(text=escaped(text), showarrow=False, bgcolor=VEIL, font=font, **where)
 
 
-def _data(layer: go.Scatter | go.Bar | go.Heatmap) -> pd.DataFrame:
-    if isinstance(layer, go.Heatmap):
-        x, y = np.meshgrid(layer.x, layer.y)
-        return pd.DataFrame({"x": x.ravel(), "y": y.ravel(), "value": layer.z.ravel()}).dropna()
-    values = layer.marker.color if isinstance(layer.marker.color, np.ndarray) else np.nan
-    return pd.DataFrame({"x": layer.x, "y": layer.y, "value": values})
+def _data(trace: Trace) -> pd.DataFrame:
+    if trace["type"] == "heatmap":
+        x, y = np.meshgrid(trace["x"], trace["y"])
+        return pd.DataFrame({"x": x.ravel(), "y": y.ravel(), "value": trace["z"].ravel()}).dropna()
+    color = trace.get("marker", {}).get("color")
+    values = color if isinstance(color, np.ndarray) else np.nan
+    return pd.DataFrame({"x": trace["x"], "y": trace["y"], "value": values})
 
 
 def _light(values: ArrayLike) -> NDArray[np.float32]:

@@ -2,13 +2,14 @@
 
 import math
 import textwrap
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
-import plotly.graph_objects as go
+import numpy as np
 
-from .figure import Chart, Layer, Panel
+from .figure import Annotation, Chart, Layer, Panel, Trace
 from .style import FAINT, GRID, INK, SPINE, WIDTH, base_layout, escaped
 
 # All in pixels. Letters have mean widths: 9 in a panel's title, 7 in legends and names.
@@ -17,7 +18,11 @@ _LEFT, _RIGHT, _COLOR_BAR = 74.0, 14.0, 86.0
 _LEGEND_ROW, _TITLE_ROW = 21.0, 24.0
 
 
-def draw(chart: Chart, width: float = WIDTH) -> go.Figure:
+Figure: TypeAlias = dict[str, Any]
+"""`data`, the traces, and `layout`, as plotly.js reads them; numbers of traces are arrays."""
+
+
+def draw(chart: Chart, width: float = WIDTH) -> Figure:
     """Draw a chart as wide as its page, in pixels; its caption is for the text around it.
 
     Below `WIDTH` all panels stand below each other; the traces are the same.
@@ -29,14 +34,16 @@ def draw(chart: Chart, width: float = WIDTH) -> go.Figure:
     top = 46.0 + 20.0 * layout["title"]["text"].count("<br>")
     heights = [[max(getattr(box, part) for box in row) for part in ("head", "body", "foot")] for row in rows]
     total = top + sum(map(sum, heights))
-    figure = go.Figure(layout=layout)
-    figure.update_layout(
-        title={"y": 1 - 22 / total, "yref": "container"},
-        height=round(total),
-        margin={"l": 0, "r": 0, "t": 0, "b": 0},
-        barmode="overlay",
-        hovermode="closest",
-    )
+    layout["title"] |= {"y": 1 - 22 / total, "yref": "container"}
+    layout |= {
+        "height": round(total),
+        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
+        "barmode": "overlay",
+        "hovermode": "closest",
+        "shapes": [],
+        "annotations": [],
+    }
+    figure: Figure = {"data": [], "layout": layout}
     columns = [(len(row), column) for row in chart.rows for column in range(len(row))]
     number = 0
     for row, (head, body, foot) in zip(rows, heights, strict=True):
@@ -53,7 +60,7 @@ def draw(chart: Chart, width: float = WIDTH) -> go.Figure:
             _draw_panel(figure, box, axes)
             first = columns.index(columns[number - 1]) + 1
             if chart.share_x and first != number:
-                figure.layout[f"xaxis{number}"].matches = "x" if first == 1 else f"x{first}"
+                layout[f"xaxis{axes.suffix}"]["matches"] = "x" if first == 1 else f"x{first}"
         top += body + foot
     return figure
 
@@ -72,7 +79,7 @@ class _Box:
     @cached_property
     def names(self) -> list[str]:
         """Return the names in the legend; annotations are never there."""
-        return [layer.name for layer in self.panel.layers if getattr(layer, "showlegend", False)]
+        return [layer["name"] for layer in self.panel.layers if layer.get("showlegend")]
 
     @cached_property
     def legend_rows_along(self) -> int:
@@ -146,41 +153,45 @@ class _Axes:
     height: float
 
 
-def _draw_panel(figure: go.Figure, box: _Box, axes: _Axes) -> None:
+def _draw_panel(figure: Figure, box: _Box, axes: _Axes) -> None:
     x_name, y_name, legend = f"x{axes.suffix}", f"y{axes.suffix}", f"legend{axes.suffix}"
-    figure.update_layout(_axis_styles(box, axes))
-    _draw_title_and_legend(figure, box, axes)
+    data, layout = figure["data"], figure["layout"]
+    layout |= _axis_styles(box, axes)
+    _draw_title_and_legend(layout, box, axes)
     for layer in box.panel.layers:
-        if isinstance(layer, go.layout.Shape | go.layout.Annotation):
-            item = layer.to_plotly_json()
-            item |= {"xref": item["xref"].replace("x", x_name), "yref": item["yref"].replace("y", y_name)}
-            if isinstance(layer, go.layout.Annotation):
-                figure.add_annotation(item)
-            else:
-                figure.add_shape(item | ({"legend": legend} if layer.showlegend else {}))
+        if isinstance(layer, Trace):
+            trace = {**layer, "xaxis": x_name, "yaxis": y_name}
+            if trace["type"] != "heatmap":
+                trace["legend"] = legend
+            if (scaled := _scaled(layer)) is not None:
+                # In the layout, because that of a phone has the bar at another place.
+                color_axis = f"coloraxis{len(data) + 2}"
+                layout[color_axis] = _color_axis(scaled, axes)
+                referring = {**scaled, "coloraxis": color_axis, "colorscale": None, "colorbar": None}
+                trace |= referring if scaled is layer else {"marker": referring}
+            data.append(trace)
             continue
-        figure.add_trace(layer)
-        trace = figure.data[-1]
-        trace.update(xaxis=x_name, yaxis=y_name)
-        if trace.type != "heatmap":
-            trace.legend = legend
-        if (scaled := _scaled(trace)) is not None:
-            # In the layout, because that of a phone has the bar at another place.
-            color_axis = f"coloraxis{len(figure.data) + 1}"
-            figure.update_layout({color_axis: _color_axis(scaled, axes)})
-            scaled.update(coloraxis=color_axis, colorscale=None, colorbar=None)
+        item = {
+            **layer,
+            "xref": layer["xref"].replace("x", x_name),
+            "yref": layer["yref"].replace("y", y_name),
+        }
+        if isinstance(layer, Annotation):
+            layout["annotations"].append(item)
+        else:
+            layout["shapes"].append(item | ({"legend": legend} if layer.get("showlegend") else {}))
 
 
-def _scaled(layer: Layer) -> Any:
+def _scaled(layer: Layer) -> dict[str, Any] | None:
     """Return the part of a trace that has a colour scale, None where there is none."""
-    part = layer if isinstance(layer, go.Heatmap) else getattr(layer, "marker", None)
-    return part if part is not None and part.colorscale is not None else None
+    part = layer if layer.get("type") == "heatmap" else layer.get("marker", {})
+    return part if "colorscale" in part else None
 
 
-def _color_axis(scaled: Any, axes: _Axes) -> dict[str, Any]:
-    ends = ("zmin", "zmax") if isinstance(scaled, go.Heatmap) else ("cmin", "cmax")
+def _color_axis(scaled: Mapping[str, Any], axes: _Axes) -> dict[str, Any]:
+    ends = ("zmin", "zmax") if "zmin" in scaled else ("cmin", "cmax")
     bar = {
-        "title": {"text": scaled.colorbar.title.text, "side": "right", "font": {"size": 12}},
+        "title": {"text": scaled["colorbar"]["title"]["text"], "side": "right", "font": {"size": 12}},
         "x": axes.x[1] + 6.0 / axes.width,
         "xanchor": "left",
         "y": sum(axes.y) / 2,
@@ -192,12 +203,16 @@ def _color_axis(scaled: Any, axes: _Axes) -> dict[str, Any]:
         "tickfont": {"size": 11, "color": FAINT},
     }
     low, high = (scaled[end] for end in ends)
-    return {"cmin": low, "cmax": high, "colorscale": scaled.colorscale, "colorbar": bar}
+    colors = scaled["colorscale"]
+    scale = [
+        [share, color] for share, color in zip(np.linspace(0, 1, len(colors)).tolist(), colors, strict=True)
+    ]
+    return {"cmin": low, "cmax": high, "colorscale": scale, "colorbar": bar}
 
 
 def _axis_styles(box: _Box, axes: _Axes) -> dict[str, Any]:
     panel = box.panel
-    heat = any(isinstance(layer, go.Heatmap) for layer in panel.layers)
+    heat = any(layer.get("type") == "heatmap" for layer in panel.layers)
     styles: list[dict[str, Any]] = []
     for label, names in ((panel.x_label, panel.x_names), (panel.y_label, panel.y_names)):
         style: dict[str, Any] = {
@@ -228,7 +243,7 @@ def _axis_styles(box: _Box, axes: _Axes) -> dict[str, Any]:
     return {f"xaxis{axes.suffix}": x, f"yaxis{axes.suffix}": y}
 
 
-def _draw_title_and_legend(figure: go.Figure, box: _Box, axes: _Axes) -> None:
+def _draw_title_and_legend(layout: dict[str, Any], box: _Box, axes: _Axes) -> None:
     legend = {
         "x": axes.x[0],
         "y": axes.y[1] + (box.legend + 4.0 if box.upright else 2.0) / axes.height,
@@ -240,17 +255,18 @@ def _draw_title_and_legend(figure: go.Figure, box: _Box, axes: _Axes) -> None:
         "bgcolor": "rgba(0,0,0,0)",
         "tracegroupgap": 0,
     }
-    figure.update_layout({f"legend{axes.suffix}": legend})
+    layout[f"legend{axes.suffix}"] = legend
     if box.title:
-        figure.add_annotation(
-            text="<b>" + "<br>".join(map(escaped, box.title)) + "</b>",
-            showarrow=False,
-            align="left",
-            x=axes.x[0],
-            y=axes.y[1] + (box.legend + 6.0) / axes.height,
-            xref="paper",
-            yref="paper",
-            xanchor="left",
-            yanchor="bottom",
-            font={"size": 14, "color": INK},
-        )
+        title = {
+            "text": "<b>" + "<br>".join(map(escaped, box.title)) + "</b>",
+            "showarrow": False,
+            "align": "left",
+            "x": axes.x[0],
+            "y": axes.y[1] + (box.legend + 6.0) / axes.height,
+            "xref": "paper",
+            "yref": "paper",
+            "xanchor": "left",
+            "yanchor": "bottom",
+            "font": {"size": 14, "color": INK},
+        }
+        layout["annotations"].append(title)

@@ -6,14 +6,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import plotly.graph_objects as go
 from numpy.typing import ArrayLike, NDArray
 
 from deepracer_exp.analysis.statistics import Values, means
 from deepracer_exp.tracks.outline import Outline
 from deepracer_exp.tracks.track import Track
 
-from .figure import Layer, Panel, colored_points, heatmap, line, note
+from .figure import Annotation, Layer, Panel, Shape, Trace, colored_points, heatmap, line, note
 from .style import FAINT, ROAD_CENTER, ROAD_EDGE, ROAD_FILL
 
 LEAST_STEPS = 4
@@ -60,13 +59,11 @@ class Grid:
         """Number of cells."""
         return self.columns * self.rows
 
-    def means(
-        self, rows: pd.DataFrame, values: ArrayLike, scale: str, least: int = 1, **more: Any
-    ) -> go.Heatmap:
+    def means(self, rows: pd.DataFrame, values: ArrayLike, scale: str, least: int = 1, **more: Any) -> Trace:
         """Return the means of values in the cells of the rows' `X` and `Y` as the layer of a map."""
         return self.cells(means(self.of(rows["X"], rows["Y"]), values, self.count, least), scale, **more)
 
-    def cells(self, values: Values, scale: str, **more: Any) -> go.Heatmap:
+    def cells(self, values: Values, scale: str, **more: Any) -> Trace:
         """Return values (count,) as the layer of a map; see `heatmap`."""
         x = self.low_x + self.side_m * (np.arange(self.columns) + 0.5)
         y = self.low_y + self.side_m * (np.arange(self.rows) + 0.5)
@@ -118,14 +115,14 @@ def beside(course: Track, place: Values, offset_m: Values) -> Values:
     return center + offset_m[:, None] * np.column_stack([-ahead[:, 1], ahead[:, 0]])
 
 
-def _road(rings: Sequence[Values], center: Values) -> list[go.layout.Shape]:
+def _road(rings: Sequence[Values], center: Values) -> list[Shape]:
     """Return the road and its centre line as shapes, because traces are drawn above every heat map."""
     common = {"type": "path", "xref": "x", "yref": "y", "layer": "below"}
     area = "".join(_path(ring) + "Z" for ring in rings)
     edge, dashes = {"color": ROAD_EDGE, "width": 1.4}, {"color": ROAD_CENTER, "width": 1, "dash": "dash"}
     return [
-        go.layout.Shape(path=area, fillcolor=ROAD_FILL, fillrule="evenodd", line=edge, **common),
-        go.layout.Shape(path=_path(center), line=dashes, **common),
+        Shape(path=area, fillcolor=ROAD_FILL, fillrule="evenodd", line=edge, **common),
+        Shape(path=_path(center), line=dashes, **common),
     ]
 
 
@@ -136,9 +133,9 @@ def _path(points: Values) -> str:
 def _extent(layers: Sequence[Layer]) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the ranges of x and y that show all lines, points and texts, with a small rim."""
     places = [
-        np.column_stack([np.atleast_1d(layer.x), np.atleast_1d(layer.y)])
+        np.column_stack([np.atleast_1d(layer["x"]), np.atleast_1d(layer["y"])])
         for layer in layers
-        if isinstance(layer, go.Scatter | go.layout.Annotation)
+        if isinstance(layer, Annotation) or layer.get("type") == "scatter"
     ]
     corners = np.concatenate(places).astype(np.float64)
     low, high = np.nanmin(corners, axis=0), np.nanmax(corners, axis=0)
@@ -147,13 +144,13 @@ def _extent(layers: Sequence[Layer]) -> tuple[tuple[float, float], tuple[float, 
     return (left, right), (bottom, top)
 
 
-def _waypoint_numbers(course: Track) -> list[go.layout.Annotation]:
+def _waypoint_numbers(course: Track) -> list[Annotation]:
     """Return the numbers of waypoints, outside the road."""
     last = len(course.waypoints) - course.closed
     # Long courses have more waypoints than room for their numbers.
     every = _NUMBERED * max(1, round(last / 160))
     far_m = _LABEL * float(np.ptp(course.outer, axis=0).max())
-    notes: list[go.layout.Annotation] = []
+    notes: list[Annotation] = []
     for k in range(0, last - every // 2 if course.closed else last, every):
         sides = []
         for border in (course.outer, course.inner):
@@ -162,6 +159,6 @@ def _waypoint_numbers(course: Track) -> list[go.layout.Annotation]:
         # On the side with more room to other parts of the road.
         rooms = [float(np.linalg.norm(course.waypoints - side, axis=1).min()) for side in sides]
         x, y = sides[int(rooms[1] > 1.05 * rooms[0])].tolist()
-        if all(np.hypot(other.x - x, other.y - y) > far_m for other in notes):
+        if all(np.hypot(other["x"] - x, other["y"] - y) > far_m for other in notes):
             notes.append(note((x, y), str(k)))
     return notes

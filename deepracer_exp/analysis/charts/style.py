@@ -61,7 +61,6 @@ def base_layout(title: str, width: float = WIDTH) -> dict[str, Any]:
     letters = round(width / _TITLE_LETTER)
     lines = [line for part in title.split("\n") for line in textwrap.wrap(part, letters) or [""]]
     return {
-        "template": "none",
         "title": {
             "text": "<b>" + "<br>".join(lines) + "</b>",
             "x": 0.0,

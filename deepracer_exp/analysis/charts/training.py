@@ -160,7 +160,7 @@ def evaluations(view: LogView) -> Chart | None:
         (complete & put_back, "complete with resets", ORANGE, "diamond"),
         (~complete, "not complete", VERMILION, "x"),
     )
-    progress = [
+    progress: list[Layer] = [
         points(x[some], episodes["progress"][some], color, name, symbol=symbol, size=8)
         for some, name, color, symbol in parts
         if some.any()

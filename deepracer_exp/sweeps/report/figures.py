@@ -148,6 +148,7 @@ def _styled(figure: go.Figure, title: str, height: float, *, legend: bool = True
     """Apply the style that all figures share."""
     figure.update_layout(
         base_layout(title),
+        template="none",
         meta={"title": title},
         height=round(height),
         width=None,

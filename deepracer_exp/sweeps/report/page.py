@@ -1,6 +1,7 @@
 """The HTML page of a study, which needs nothing beside it."""
 
 import base64
+import json
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -53,7 +54,13 @@ def study_page(study: optuna.Study) -> str:
     trials = study.get_trials(deepcopy=False)
     complete = complete_trials(study)
     plots = [
-        plot(figure, name, figure.layout.meta["title"], narrowed(figure), least_width(figure))
+        plot(
+            json.loads(figure.to_json()),
+            name,
+            figure.layout.meta["title"],
+            json.loads(narrowed(figure).to_json()),
+            least_width(figure),
+        )
         for name, figure in figures(study).items()
     ]
     keys = short_keys(sorted({key for trial in trials for key in trial.params}))
