@@ -23,6 +23,8 @@ from deepracer_exp.tracks.track import Track, TrackIndex, Tracks, world_track
 
 _SAMPLE = 2000
 """Rows of a course that are used to recognise it."""
+_HEAD = 20_000
+"""Rows of a course that show in which direction it is driven."""
 _LENGTH_NEAR = 0.01
 """Share by which a logged length may differ from that of the course."""
 _INSIDE = 0.95
@@ -62,10 +64,11 @@ def find_courses(recording: Recording) -> tuple[dict[str, Track], tuple[LogProbl
                 problems.append(LogProblem(str(file), None, str(error)))
             break
     tracks: dict[str, Track] = {}
-    names = recording.steps["track"].astype(str).to_numpy()
-    for name in pd.unique(names):
-        rows = recording.steps.iloc[np.flatnonzero(names == name)]
-        sample = rows.iloc[:: max(1, len(rows) // _SAMPLE)]
+    steps = recording.steps
+    names = steps["track"].astype("category").cat.remove_unused_categories()
+    for code, name in enumerate(map(str, names.cat.categories)):
+        rows = np.flatnonzero(names.cat.codes == code)
+        sample = steps.iloc[rows[:: max(1, len(rows) // _SAMPLE)]]
         logged = name or recording.track or ""
         try:
             if logged in configs:
@@ -76,7 +79,7 @@ def find_courses(recording: Recording) -> tuple[dict[str, Track], tuple[LogProbl
                     problems.append(LogProblem(recording.name, None, _of_another_width(logged, world)))
             else:
                 raise BadInput(_unknown(logged, sample))
-            tracks[name] = directed(both[0], both[1], rows)
+            tracks[name] = directed(both[0], both[1], steps.iloc[rows[:_HEAD]])
         except BadInput as error:
             problems.append(LogProblem(recording.name, None, str(error)))
     return tracks, tuple(problems)
@@ -252,7 +255,7 @@ def waypoint_positions(course: Track) -> NDArray[np.float64]:
 
 def directed(forward: Track, backward: Track, steps: pd.DataFrame) -> Track:
     """Return the course in the direction in which progress grows in most of the first rows."""
-    head = steps.iloc[: 10 * _SAMPLE].sort_values("episode", kind="stable")
+    head = steps.iloc[:_HEAD].sort_values("episode", kind="stable")
     along = progress_along(forward, head, head["episode"].to_numpy(np.int64))
     return backward if along.sum() < 0.0 else forward
 

@@ -218,7 +218,7 @@ def prepare(log: Recording | RunRecording, track: str | None = None) -> LogView:
         raise BadInput(recording.name, f"track={track} was not driven on", ", ".join(logged))
     tracks, problems = find_courses(recording)
     here = (names == name).to_numpy()
-    driven_on = steps[here]
+    driven_on = steps if here.all() else steps[here]
     course = tracks.get(name)
     if track is not None and track not in logged:
         course_now, problems = course, ()
