@@ -82,7 +82,7 @@ def map_panel(course: Track, layers: Sequence[Layer], title: str = "", numbers: 
     return Panel(layers=shown, title=title, map=True, x_range=x_range, y_range=y_range)
 
 
-def outlines(corners: Values, color: str, name: str | None = None, width: float = 1.5) -> go.Scatter:
+def outlines(corners: Values, color: str, name: str | None = None, width: float = 1.5) -> Trace:
     """Return the outlines of boxes, corners (k, 4, 2), as one layer of a map."""
     closed = np.concatenate([corners, corners[:, :1], np.full((len(corners), 1, 2), np.nan)], axis=1)
     x, y = closed.reshape(-1, 2)[:-1].T
