@@ -203,10 +203,11 @@ def _chart(track: str, laps: Sequence[ReplayedLap]) -> Chart:
         moved = list(lap.others_by_key.items())
         for (key_x, xs), (key_y, ys) in zip(moved[::2], moved[1::2], strict=True):
             paths.append(_moved(number, key_x, key_y, xs, ys, color))
-            paths[-1].marker.update(symbol="square", size=9)
+            paths[-1]["marker"] |= {"symbol": "square", "size": 9}
         paths.append(line(lap.x_m, lap.y_m, color, letter, width=1.5))
         cars.append(_moved(number, "x", "y", lap.x_m, lap.y_m, color))
-        cars[-1].update(mode="lines+markers", line={"width": 7, "color": color}, marker={"size": [1, 12]})
+        cars[-1].update(mode="lines+markers", line={"width": 7, "color": color})
+        cars[-1]["marker"] |= {"size": [1, 12]}
         place = 100 * (lap.driven % 1.0 if lap.track.closed else lap.driven)
         crossed = np.flatnonzero(np.diff(place) < -50) + 1
         for name, values in (("speed", lap.speed_mps), ("steering", lap.steering_deg)):
