@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deepracer_exp.config.race import BotsConfig, BoxesConfig, RaceConfig
-from deepracer_exp.sim.others import END_M, Others, closest, next_ones
+from deepracer_exp.config.race import RaceConfig
+from deepracer_exp.sim.others import Others, closest, next_ones
 from deepracer_exp.tracks.lanes import INNER, OUTER, Lanes
 from deepracer_exp.tracks.track import Pose
 
 from .observation import OTHERS
+from .placement import draw_placement
 from .randomization import CarStreams, Purpose
 from .rules import Bools, Ids, RaceRules, StepResult, lap_clock_s
 from .setup import RaceSetup
@@ -47,6 +48,7 @@ class RaceOthers:
     Attributes:
         others: where they are.
         held: cars that serve a penalty, (N,), bool: they stand, no rule is applied, and bots drive on.
+        bots_stopped: cars whose bots stopped in the last step, (N,), bool.
     """
 
     def __init__(self, race: RaceConfig, setup: RaceSetup, rules: RaceRules):
@@ -69,10 +71,7 @@ class RaceOthers:
         self._held_until = np.zeros(rules.n_cars, np.int64)
         self._in_bot = np.zeros(rules.n_cars, bool)
         self.held = np.zeros(rules.n_cars, bool)
-        self._fixed_m = np.array([position.lap for position in race.boxes.positions])
-        self._fixed_lane = np.array(
-            [INNER if position.lane == "inner" else OUTER for position in race.boxes.positions], np.int64
-        )
+        self.bots_stopped = np.zeros(rules.n_cars, bool)
         looks = [(*_SIZE_M[bot], *_COLOR[bot]) for bot in self.others.is_bot.tolist()]
         self._looks = np.array(looks, np.float32)
 
@@ -140,7 +139,9 @@ class RaceOthers:
         has_hit = (hit >= 0) & running
         self._in_bot = has_hit & others.is_bot[hit]
         behind, ahead = self._who_is_behind(has_hit, hit, result.progress)
+        pauses = others.pauses.copy()
         others.pause(ahead, time_s)
+        self.bots_stopped = others.pauses > pauses
         status = with_crashes(result.status, has_hit, behind)
         status[self.held] = STATUS_CODE["pause"]
         rules.rest(np.flatnonzero(self.held))
@@ -219,33 +220,14 @@ class RaceOthers:
         """Draw where the others of new episodes are, and put them there."""
         rules, race = self._rules, self._race
         track_index = rules.track_index[ids]
-        boxes, bots = race.boxes.count, race.bots.count
-        places_m, lanes = np.zeros((len(ids), boxes + bots)), np.zeros((len(ids), boxes + bots), np.int64)
+        count = race.boxes.count + race.bots.count
+        places_m, lanes = np.zeros((len(ids), count)), np.zeros((len(ids), count), np.int64)
         seeds = np.zeros(len(ids), np.uint64)
         for row, car in enumerate(ids.tolist()):
             length_m, episode = float(rules.tracks.length_m[track_index[row]]), int(rules.episode[car])
-            stream = self._streams.stream(car, episode)
-            seeds[row] = stream.integers(2**63)
-            if race.boxes.placement == "fixed":
-                places_m[row, :boxes], lanes[row, :boxes] = self._fixed_m * length_m, self._fixed_lane
-            else:
-                least_m = self._least_m(length_m, episode)
-                places_m[row, :boxes], lanes[row, :boxes] = _placed(race.boxes, least_m, length_m, stream)
-            places_m[row, boxes:], lanes[row, boxes:] = _placed(
-                race.bots, race.bots.min_distance_m, length_m, stream
-            )
+            drawn = draw_placement(race, length_m, episode, self._streams.stream(car, episode))
+            places_m[row], lanes[row], seeds[row] = drawn.places_m, drawn.lanes, drawn.seed
         self.others.place(ids, track_index, places_m, lanes, seeds)
-
-    def _least_m(self, length_m: float, episode: int) -> float:
-        """Return the least distance between boxes in an episode.
-
-        The service takes its number for per cent of the lap, and applies that to its own result at every placement, of
-        which there is one more than episodes (deepracer-simapp, agent_ctrl/obstacles_agent_ctrl.py).
-        """
-        least = self._race.boxes.min_distance_m
-        if self._race.quirks == "fixed":
-            return least
-        return min(least * (length_m / 100) ** (episode + 2), length_m)
 
     def _beside(self, ids: Ids, pose: Pose, checked: Bools) -> Pose:
         """Return start poses in the lane opposite to the nearest other where one is near, (n,) each."""
@@ -354,25 +336,6 @@ def with_crashes(status: NDArray[np.int64], has_hit: Bools, at_fault: Bools) -> 
     """
     outcome = np.where(at_fault, STATUS_CODE["crashed"], STATUS_CODE["in_progress"])
     return np.where(has_hit & _GIVES_WAY[status], outcome, status)
-
-
-def _placed(
-    config: BoxesConfig | BotsConfig, least_m: float, length_m: float, stream: np.random.Generator
-) -> tuple[Floats, NDArray[np.int64]]:
-    """Return places along the lap and lanes, (count,) each, as the service draws them.
-
-    At random, each in turn is moved to anywhere between its neighbours that keeps the least distance.
-    """
-    count = config.count
-    places_m = np.linspace(least_m, length_m - END_M, count)
-    if config.placement != "random":
-        return places_m, np.arange(count) % 2
-    for index in stream.permutation(count).tolist():
-        low_m = least_m if index == 0 else places_m[index - 1] + least_m
-        high_m = length_m - END_M if index == count - 1 else places_m[index + 1] - least_m
-        if low_m < high_m:
-            places_m[index] = stream.uniform(low_m, high_m)
-    return places_m, stream.integers(2, size=count)
 
 
 def around(away_m: Floats, length_m: Floats) -> Floats:

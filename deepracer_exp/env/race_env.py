@@ -12,7 +12,6 @@ from torchrl.envs import EnvBase
 from deepracer_exp.sim.lidar import FURTHEST_M
 
 from .race import Race
-from .trace import PACKED
 
 _FLAGS = ("done", "terminated", "truncated")
 
@@ -22,7 +21,7 @@ class RaceEnv(EnvBase):
 
     Keys: `observation` (float32 features), with a camera `pixels` (uint8, channels x height x width), with a LIDAR
     `lidar` (float32), `action` (int64 index, or float32 steering and speed in -1..1), and under `next` also `reward`,
-    `done`, `terminated`, `truncated` and `trace` (float64, columns `env.trace.PACKED_COLUMNS`). `trace` is part
+    `done`, `terminated`, `truncated` and `trace` (float64, columns those of `Race.trace`). `trace` is part
     of the reward spec because it exists only after a step.
     """
 
@@ -53,7 +52,7 @@ class RaceEnv(EnvBase):
         )
         self.full_reward_spec = Composite(
             reward=Unbounded((n_cars, 1), dtype=torch.float32),
-            trace=Unbounded((n_cars, len(PACKED)), dtype=torch.float64),
+            trace=Unbounded(race.trace.shape, dtype=torch.float64),
             shape=(n_cars,),
         )
         flags = {key: Categorical(2, shape=(n_cars, 1), dtype=torch.bool) for key in _FLAGS}

@@ -80,6 +80,9 @@ PACKED_COLUMNS = tuple(
 action space."""
 PACKED = {name: place for place, name in enumerate(PACKED_COLUMNS)}
 """Column number of each packed column."""
+OTHERS_PACKED = ("own_episode", "bots_stopped")
+"""Columns after these among boxes and bots: the number of the episode among those of its car, and whether all bots
+stopped in this step because one had hit the car."""
 SCHEMA = pa.schema([pa.field(name, kind, metadata={"unit": unit}) for name, kind, unit in _COLUMNS])
 
 

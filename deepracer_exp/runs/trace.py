@@ -3,7 +3,7 @@
 import contextlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -14,7 +14,7 @@ from deepracer_exp.errors import BadInput, RunFailed
 if TYPE_CHECKING:
     import pandas as pd
 
-_ENDING = "-iteration.parquet"
+_ENDING, _OTHERS_ENDING = "-iteration.parquet", "-others.parquet"
 _CONTINUOUS = (
     *("X", "Y", "yaw", "reward", "progress", "tstamp"),
     *("speed_mps", "yaw_rate_radps", "offset_m", "heading_error_rad", "episode_return"),
@@ -36,17 +36,24 @@ class TraceWriter:
         Raises:
             RunFailed: the file cannot be written (disk full, folder read-only).
         """
-        path = self.folder / f"{iteration:05d}{_ENDING}"
+        encoding = dict.fromkeys(_CONTINUOUS, "BYTE_STREAM_SPLIT")
+        name = f"{iteration:05d}{_ENDING}"
+        return self._write(name, table, use_dictionary=_REPEATING, column_encoding=encoding)
+
+    def write_others(self, iteration: int, table: pa.Table) -> Path:
+        """Write `placement.placements_table` of an iteration and return the file, `00012-others.parquet`.
+
+        Raises:
+            RunFailed: the file cannot be written.
+        """
+        return self._write(f"{iteration:05d}{_OTHERS_ENDING}", table)
+
+    def _write(self, name: str, table: pa.Table, **how: Any) -> Path:
+        path = self.folder / name
         unfinished = path.with_name(f".{path.name}")
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            pq.write_table(
-                table,
-                unfinished,
-                compression="zstd",
-                use_dictionary=_REPEATING,
-                column_encoding=dict.fromkeys(_CONTINUOUS, "BYTE_STREAM_SPLIT"),
-            )
+            pq.write_table(table, unfinished, compression="zstd", **how)
             unfinished.replace(path)
         except OSError as error:
             # Where a file cannot be written, deleting one may fail, too.

@@ -10,8 +10,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import psutil
 import torch
+from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
 from deepracer_exp.agents.algorithm import UpdateMetrics
@@ -21,8 +23,9 @@ from deepracer_exp.collectors.collector import open_collector
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.action_space import DiscreteActions
 from deepracer_exp.env.observation import observation_shape
+from deepracer_exp.env.placement import placements_table
 from deepracer_exp.env.setup import RaceSetup
-from deepracer_exp.env.trace import to_table
+from deepracer_exp.env.trace import PACKED, to_table
 from deepracer_exp.errors import RunFailed, reading
 from deepracer_exp.evaluation.result import Evaluation
 from deepracer_exp.runs.checkpoints import CheckpointStore, read_agent
@@ -255,7 +258,7 @@ class Trainer:
                 # 4. Callbacks: evaluate, stop?, prune?, budget?, record, track, display.
                 self._call("on_iteration_end")
                 is_best = self.best.evaluated_best(self.evaluation, self.counters())
-                self._trace.write(self.iteration, to_table(rows, self.iteration, self.metrics.track_names))
+                self._write_trace(rows)
                 self._check_interruption()
                 # After the evaluation, which thus raced against those that the policy has learned to beat.
                 if self.rivals is not None and self.rivals.take(self.iteration):
@@ -280,6 +283,13 @@ class Trainer:
         """
         if self.ending is None:
             self.ending = reason if isinstance(reason, Ending) else Ending(status, reason)
+
+    def _write_trace(self, rows: NDArray[np.float64]) -> None:
+        """Write the steps of an iteration, and where the boxes and bots around them were."""
+        extra, rows = rows[:, len(PACKED) :], rows[:, : len(PACKED)]
+        self._trace.write(self.iteration, to_table(rows, self.iteration, self.metrics.track_names))
+        if extra.shape[1]:
+            self._trace.write_others(self.iteration, placements_table(self.setup, rows, extra))
 
     def request_save(self) -> None:
         """Write a checkpoint after this iteration."""

@@ -1,0 +1,195 @@
+"""The placement of boxes and bots in an episode: drawn, written beside the trace, and their poses rebuilt from it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from deepracer_exp.config.race import LANES, BotsConfig, BoxesConfig, RaceConfig
+from deepracer_exp.sim.others import END_M, Others
+from deepracer_exp.tracks.lanes import Lanes
+from deepracer_exp.tracks.track import Track, Tracks
+
+from .randomization import CarStreams, Purpose
+from .rules import lap_clock_s
+from .setup import RaceSetup
+from .trace import PACKED
+
+Floats = NDArray[np.float64]
+
+_COLUMNS: tuple[tuple[str, pa.DataType, str], ...] = (
+    ("episode", pa.int32(), "number of the episode in the trace"),
+    ("car", pa.int32(), "number of the car over all processes"),
+    ("reversed", pa.bool_(), "the track is driven against its published direction"),
+    (
+        "places_m",
+        pa.list_(pa.float64()),
+        "m from the start line along the centre line, of each box and then each bot",
+    ),
+    (
+        "lanes",
+        pa.list_(pa.int8()),
+        " ".join(f"{number}={name}" for number, name in enumerate(LANES)) + ", of each",
+    ),
+    ("seed", pa.uint64(), "decides when bots change lanes"),
+    (
+        "bots_stopped_at_s",
+        pa.list_(pa.float64()),
+        "s since the reset: all bots stopped in these rows of the trace",
+    ),
+)
+SCHEMA = pa.schema([pa.field(name, kind, metadata={"unit": unit}) for name, kind, unit in _COLUMNS])
+"""One row for each episode that drove in an iteration."""
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Where the others of an episode are at its begin; arrays are (K,), boxes first."""
+
+    places_m: Floats
+    """Distances from the start line along the centre line."""
+    lanes: NDArray[np.int64]
+    seed: int
+    """Decides when bots change lanes."""
+
+
+def draw_placement(race: RaceConfig, length_m: float, episode: int, stream: np.random.Generator) -> Placement:
+    """Draw where the others of an episode are.
+
+    Args:
+        race: how many there are, and how they are placed.
+        length_m: of the centre line.
+        episode: its number among those of its car, from 0.
+        stream: of the car and the episode.
+    """
+    seed = int(stream.integers(2**63))
+    if race.boxes.placement == "fixed":
+        positions = race.boxes.positions
+        boxes_m = np.array([position.lap for position in positions]) * length_m
+        lanes = np.array([LANES.index(position.lane) for position in positions], np.int64)
+    else:
+        boxes_m, lanes = _placed(race.boxes, _least_m(race, length_m, episode), length_m, stream)
+    bots_m, bots_lanes = _placed(race.bots, race.bots.min_distance_m, length_m, stream)
+    return Placement(np.concatenate([boxes_m, bots_m]), np.concatenate([lanes, bots_lanes]), seed)
+
+
+def placements_table(setup: RaceSetup, rows: NDArray[np.float64], extra: NDArray[np.float64]) -> pa.Table:
+    """Return what is written of the others of a batch, with the columns of `SCHEMA`.
+
+    Placements are drawn again from the streams of their cars, as in the processes that drove them.
+
+    Args:
+        setup: of the race, which has boxes or bots.
+        rows: the packed trace by episode and step, (n, len(PACKED)).
+        extra: the columns `trace.OTHERS_PACKED` of the same rows, (n, 2).
+    """
+    assert setup.others is not None
+    number = rows[:, PACKED["episode"]].astype(np.int64)
+    first = np.flatnonzero(np.diff(number, prepend=-1) != 0)
+    cars, place = np.unique(rows[first, PACKED["car"]].astype(np.int64), return_inverse=True)
+    streams = CarStreams(setup.seed, cars.tolist(), Purpose.OTHERS)
+    written = []
+    for row, last, car in zip(first.tolist(), [*first[1:].tolist(), len(rows)], place.tolist(), strict=True):
+        episode = int(extra[row, 0])
+        course = setup.courses[int(rows[row, PACKED["track"]])]
+        # A car stays on its course, whose directions alternate.
+        track = course.tracks[episode % len(course.tracks)]
+        drawn = draw_placement(setup.others, track.length_m, episode, streams.stream(car, episode))
+        stopped = row + np.flatnonzero(extra[row:last, 1])
+        clock_s = lap_clock_s(rows[stopped, PACKED["steps"]], setup.car.control_period_s)
+        values = (
+            *(int(number[row]), int(cars[car]), track.reversed, drawn.places_m.tolist()),
+            *(drawn.lanes.tolist(), drawn.seed, clock_s.tolist()),
+        )
+        written.append(dict(zip(SCHEMA.names, values, strict=True)))
+    return pa.Table.from_pylist(written, schema=SCHEMA)
+
+
+def read_placements(table: pa.Table) -> dict[int, tuple[Placement, Floats]]:
+    """Return the placement of each episode of written tables, and when all bots stopped, s since the reset."""
+    episodes: dict[int, tuple[Placement, Floats]] = {}
+    for row in table.to_pylist():
+        drawn, stopped_at_s = episodes.get(row["episode"], (None, np.zeros(0)))
+        if drawn is None:
+            drawn = Placement(np.array(row["places_m"]), np.array(row["lanes"], np.int64), row["seed"])
+        episodes[row["episode"]] = drawn, np.append(stopped_at_s, row["bots_stopped_at_s"])
+    return episodes
+
+
+def rebuild_poses(
+    race: RaceConfig,
+    track: Track,
+    placements: Sequence[tuple[Placement, Floats]],
+    period_s: float,
+    episode: NDArray[np.intp],
+    step: NDArray[np.int64],
+) -> tuple[Floats, Floats]:
+    """Return where the others were at rows of a trace: poses (n, K, 3) and distances along the lap in metres, (n, K).
+
+    They are driven again by the code that drove them. A row has the pose of the car at a control step and, of bots, the
+    poses of the same time; crashes and params of that step used the bots' poses of the step before, as on the service.
+
+    Args:
+        race: among whom the car drove.
+        track: on which, in its direction.
+        placements: of each episode, with the times since its reset at which all bots stopped.
+        period_s: simulated seconds of a control step.
+        episode: of each row, the index in `placements`, (n,).
+        step: of each row, (n,), the prepare step being 1.
+    """
+    others = Others(race, Lanes([track]), Tracks([track]), len(placements))
+    everyone, track_index = np.arange(len(placements)), np.zeros(len(placements), np.intp)
+    others.place(
+        everyone,
+        track_index,
+        np.stack([drawn.places_m for drawn, _ in placements]),
+        np.stack([drawn.lanes for drawn, _ in placements]),
+        np.array([drawn.seed for drawn, _ in placements], np.uint64),
+    )
+    stops = np.zeros((len(placements), int(step.max(initial=0)) + 1), bool)
+    for number, (_, stopped_at_s) in enumerate(placements):
+        steps = np.round(stopped_at_s / period_s).astype(np.int64)
+        stops[number, steps[steps < stops.shape[1]]] = True
+    poses, distance_m = np.empty((len(step), race.others, 3)), np.empty((len(step), race.others))
+    order = np.argsort(step, kind="stable")
+    bounds = np.searchsorted(step[order], np.arange(stops.shape[1] + 1))
+    for now in range(1, stops.shape[1]):
+        time_s = np.full(len(placements), lap_clock_s(now, period_s))
+        others.drive(track_index, time_s, np.full(len(placements), now > 1))
+        others.pause(stops[:, now], time_s)
+        here = order[bounds[now] : bounds[now + 1]]
+        poses[here], distance_m[here] = others.poses[episode[here]], others.distance_m[episode[here]]
+    return poses, distance_m
+
+
+def _least_m(race: RaceConfig, length_m: float, episode: int) -> float:
+    """Return the least distance between boxes in an episode.
+
+    The service takes its number for per cent of the lap, and applies that to its own result at every placement, of
+    which there is one more than episodes (deepracer-simapp, agent_ctrl/obstacles_agent_ctrl.py).
+    """
+    least = race.boxes.min_distance_m
+    if race.quirks == "fixed":
+        return least
+    return min(least * (length_m / 100) ** (episode + 2), length_m)
+
+
+def _placed(
+    config: BoxesConfig | BotsConfig, least_m: float, length_m: float, stream: np.random.Generator
+) -> tuple[Floats, NDArray[np.int64]]:
+    """Return places along the lap and lanes, (count,) each, as the service draws them.
+
+    At random, each in turn is moved to anywhere between its neighbours that keeps the least distance.
+    """
+    count = config.count
+    places_m = np.linspace(least_m, length_m - END_M, count)
+    if config.placement != "random":
+        return places_m, np.arange(count) % 2
+    for index in stream.permutation(count).tolist():
+        low_m = least_m if index == 0 else places_m[index - 1] + least_m
+        high_m = length_m - END_M if index == count - 1 else places_m[index + 1] - least_m
+        if low_m < high_m:
+            places_m[index] = stream.uniform(low_m, high_m)
+    return places_m, stream.integers(2, size=count)

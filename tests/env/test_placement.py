@@ -1,0 +1,67 @@
+"""What is written of boxes and bots rebuilds the poses that they had."""
+
+import numpy as np
+import pytest
+
+from deepracer_exp.env.placement import SCHEMA, placements_table, read_placements, rebuild_poses
+from deepracer_exp.env.race import Race
+from deepracer_exp.env.trace import PACKED
+from tests.env.conftest import make_setup, random_actions
+
+STANDING = ("action_space=continuous", "action_space.speed.low=0", "episode.immobilized_steps=0")
+SEES = "observation.next_objects=2"
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("race=object_avoidance",),
+        ("race=six_boxes",),
+        ("race=head_to_bot", "race.boxes.number=2", "race.bots.placement=random", "race.bots.speed_mps=2"),
+        ("race=head_to_bot", "race.boxes.number=2", "race.quirks=service", "track.direction=alternate"),
+    ],
+    ids=["random boxes", "fixed boxes", "both", "quirks, both directions"],
+)
+def test_every_pose_of_every_other_is_rebuilt_from_what_is_written(overrides):
+    """Also where bots have hit the car and stopped, and over several episodes of a car."""
+    hit = "race.bots.speed_mps=2" in overrides
+    setup = make_setup("track=reInvent2019_track", *STANDING, SEES, *overrides)
+    race = Race(setup, 6, first_car=3)
+    race.reset()
+    rows, poses, distances = [], [], []
+    for action in random_actions(150, 6):
+        # Cars that mostly stand are hit from behind.
+        race.step(np.tile([0.0, -1.0], (6, 1)) if hit else action)
+        rows.append(race.trace.copy())
+        others = race.others.others
+        poses.append(others.poses.copy())
+        distances.append(others.distance_m.copy())
+        ended = np.flatnonzero(race.terminated | race.truncated)
+        if len(ended):
+            race.reset(ended)
+    packed, poses, distances = (np.concatenate(values) for values in (rows, poses, distances))
+    order = np.lexsort([packed[:, PACKED[name]] for name in ("steps", "episode", "car")])
+    packed, poses, distances = packed[order], poses[order], distances[order]
+    begins = packed[:, PACKED["steps"]] == 1
+    own = packed[:, len(PACKED) :]
+    trace = packed[:, : len(PACKED)].copy()
+    trace[:, PACKED["episode"]] = np.cumsum(begins) - 1
+    table = placements_table(setup, trace, own)
+    assert table.schema == SCHEMA
+    assert len(table) == begins.sum() >= 6
+    placed = read_placements(table)
+    assert own[:, 1].any() or not hit
+    direction = np.array(table["reversed"])[trace[:, PACKED["episode"]].astype(int)]
+    for track in setup.courses[0].tracks:
+        here = direction == track.reversed
+        number = trace[here, PACKED["episode"]].astype(np.intp)
+        rebuilt, distance_m = rebuild_poses(
+            setup.others,
+            track,
+            [placed[episode] for episode in range(len(placed))],
+            setup.car.control_period_s,
+            number,
+            trace[here, PACKED["steps"]].astype(np.int64),
+        )
+        np.testing.assert_array_equal(rebuilt, poses[here])
+        np.testing.assert_array_equal(distance_m, distances[here])
