@@ -23,7 +23,7 @@ from deepracer_exp.lookup.resolve import resolve
 from deepracer_exp.runs.files import METRICS, SUMMARY, read_config, read_metrics, read_object
 from deepracer_exp.runs.recording import read_run_recording
 from deepracer_exp.training.plan import plan_resume, plan_training
-from deepracer_exp.training.run import resume_training, run_training
+from deepracer_exp.training.run import run_training
 from deepracer_exp.training.trainer import Callback, TrainResult
 
 
@@ -106,7 +106,7 @@ def resume(
         BadInput: it has ended, is being trained, or was started with other values.
     """
     plan = plan_resume(resolve(str(run), Path(runs_dir), None).path, overrides)
-    return resume_training(plan, console, callbacks)
+    return run_training(plan, console, callbacks)
 
 
 def evaluate(run: str | Path, *overrides: str) -> Evaluation:

@@ -76,11 +76,8 @@ def writing(
 ) -> Iterator[None]:
     """Turn an OSError while a file is written into `BadInput` or another failure.
 
-    Args:
-        what: as for `reading`.
-        accepted: as for `reading`.
-        failure: raised in its place.
-        also: another type of error to turn.
+    `what` and `accepted` are as for `reading`; `failure` is raised in its place, and `also` is another type of error to
+    turn.
     """
     try:
         yield

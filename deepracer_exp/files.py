@@ -45,10 +45,7 @@ _KINDS = {
 def open_user_file(path: str | Path, accepted: str, most_bytes: int) -> IO[bytes]:
     """Open a file for reading.
 
-    Args:
-        path: of the file.
-        accepted: what would be accepted, for messages.
-        most_bytes: that a file of its kind can have.
+    `accepted` is for messages; a file of its kind can have `most_bytes`.
 
     Raises:
         BadInput: it is missing, not a regular file (a pipe or a device never ends), larger, or cannot be read.
@@ -81,10 +78,7 @@ def read_text(path: str | Path, accepted: str, most_bytes: int = SETTINGS_BYTES)
 def read_json(path: str | Path, accepted: str, raw: bytes | None = None) -> Any:
     """Return what a JSON file holds.
 
-    Args:
-        path: of the file.
-        accepted: what would be accepted, for messages.
-        raw: its bytes where they are known: of a member of an archive, or a part of a log.
+    `raw` is its content where that is known: of a member of an archive, or a part of a log.
 
     Raises:
         BadInput: it cannot be read, is too large, or not JSON.
@@ -100,11 +94,7 @@ def read_yaml(
 ) -> Content | Any:
     """Return what a YAML file holds, as plain values.
 
-    Args:
-        path: of the file.
-        accepted: what would be accepted, for messages.
-        load: parses the text; None: into plain values.
-        raw: its bytes where they are known.
+    `load` parses the text, None: into plain values; `raw` is as for `read_json`.
 
     Raises:
         BadInput: it cannot be read, is too large, not YAML, contains itself, or has more values (each alias counted in
@@ -121,10 +111,7 @@ def read_yaml(
 def read_json_as(file: Path, adapter: "TypeAdapter[Content]", writer: str) -> Content | None:
     """Read a JSON file whose keys and types are those of a dataclass; None where there is no file.
 
-    Args:
-        file: to read.
-        adapter: of the dataclass.
-        writer: who writes such files, for messages: ``a clone``.
+    `writer` says in messages who writes such files: ``a clone``.
 
     Raises:
         BadInput: the file cannot be read or holds something else.
@@ -137,11 +124,6 @@ def read_json_as(file: Path, adapter: "TypeAdapter[Content]", writer: str) -> Co
 
 def read_yaml_as(path: str | Path, adapter: "TypeAdapter[Content]", accepted: str) -> Content:
     """Read a YAML file whose keys and types are those of a dataclass.
-
-    Args:
-        path: of the file.
-        adapter: of the dataclass.
-        accepted: what would be accepted, for messages.
 
     Raises:
         BadInput: the file cannot be read or holds something else.

@@ -84,11 +84,9 @@ def end_with_owner() -> None:
 def running(command: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[bytes]]:
     """Run a program, in a session of its own, that ends with the block or with this process, whichever is first.
 
-    All that the program has started in its process group ends with it.
+    The program runs in a session of its own; `options` are those of `subprocess.Popen`.
 
-    Args:
-        command: program and arguments.
-        options: of `subprocess.Popen`.
+    All that the program has started in its process group ends with it.
 
     Raises:
         OSError: it cannot be run.

@@ -12,12 +12,16 @@ VAGUE = {"one", "found", "at", "known", "own", "given", "asked", "told", "heard"
 NAMED = (
     "agents",
     "collectors",
+    "commands",
+    "config",
     "env",
     "evaluation",
+    "lookup",
     "rewards",
     "runs",
     "sim",
     "stopping",
+    "sweeps",
     "tracking",
     "training",
 )

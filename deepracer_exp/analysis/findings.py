@@ -20,8 +20,7 @@ from .sectors import Sector, sector_at, sectors_now, sectors_of
 from .slower_laps import CHANCE, LEAST_TIMES, SLOWER, slower_laps
 from .statistics import wilson
 from .tables import CANDIDATE_LAPS, DENSE
-from .zigzag import zigzag_in_words
-from .zigzag_log import CURE, ZIGZAG_DEG, ZIGZAG_PER_M, zigzag_now
+from .zigzag import CURE, ZIGZAG_DEG, ZIGZAG_PER_M, zigzag_in_words, zigzag_now
 
 CRASH_PLACE_M = 1.0
 """Crashes no further than this from one place are at one object."""

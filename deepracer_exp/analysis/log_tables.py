@@ -11,8 +11,7 @@ from deepracer_exp.errors import count
 from .against_fastest import loss_in_words
 from .charts.runs import run_folder
 from .log_view import LogView
-from .zigzag import zigzag_in_words
-from .zigzag_log import zigzag_now
+from .zigzag import zigzag_in_words, zigzag_now
 
 NONE = "\N{EN DASH}"
 MOST_ITERATIONS = 300

@@ -104,9 +104,7 @@ def fast_laps_in_words(fast: int, complete: int, fastest_s: float, where: str) -
 def commands_of_log(recording: Recording, track: str | None = None) -> Commands:
     """Return the commands of a log's fast laps on one course, of its training and of its evaluations and races.
 
-    Args:
-        recording: of the service, or of a run of ours.
-        track: as for `log_view.prepare`.
+    `track` is one of several, as for `log_view.prepare`.
 
     Raises:
         BadInput: it has no complete lap without a reset, or as for `log_view.prepare`.
@@ -161,16 +159,13 @@ def check_count(wanted: int) -> None:
 def propose_actions(commands: Commands, wanted: int, car: CarConfig) -> ActionProposal:
     """Choose the actions nearest to the commands of fast laps, and what a policy needs to recover.
 
+    `wanted` is a number of `FEWEST` to `MOST` actions.
+
     Actions are the centres of clusters (k-means) of the commands, in steering and speed weighted by `DEGREES_PER_MPS`.
     Laps that went well do not show how to come back to the line, and a policy has to learn that first. So these are
     added where no chosen action is `NEAR`: full lock to either side and straight ahead at the lowest speed of the laps
     and at most `RESCUE_MPS`, to turn and to brake, and `CORRECTION` of full lock to either side at the laps' median
     speed. Where rounded commands are the same, there are fewer actions.
-
-    Args:
-        commands: within the limits of the car.
-        wanted: number of actions, `FEWEST` to `MOST`.
-        car: whose limits hold.
 
     Raises:
         BadInput: another number of actions is asked for.

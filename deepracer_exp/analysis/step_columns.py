@@ -47,10 +47,8 @@ FIRST_STEPS = 2
 def add_derived(steps: pd.DataFrame, course: Track | None, discount: float) -> pd.DataFrame:
     """Return the steps with `DERIVED_COLUMNS`.
 
-    Args:
-        steps: rows of each episode contiguous and in the order of time.
-        course: what was driven on.
-        discount: factor on the reward of the next step.
+    The rows of each episode are contiguous and in the order of time; `discount` is the factor on the reward of the next
+    step.
     """
     x, y, yaw, time_s, progress, reward = (
         steps[name].to_numpy(np.float64) for name in ("X", "Y", "yaw", "tstamp", "progress", "reward")
@@ -105,9 +103,7 @@ def _lap_clock(
 def timed_by_service(steps: pd.DataFrame, metrics: pd.DataFrame) -> tuple[pd.DataFrame, int]:
     """Set the clocks of complete laps to the times that the service's metrics files give.
 
-    Args:
-        steps: rows of each episode contiguous, with the derived columns.
-        metrics: `recording.METRICS_COLUMNS`.
+    `steps` have the derived columns, each episode's contiguous; `metrics` has `recording.METRICS_COLUMNS`.
 
     Returns:
         The steps, and of how many laps without resets the files give the time.

@@ -248,10 +248,6 @@ def candidates(recording: Recording, iterations: pd.DataFrame) -> pd.DataFrame:
     A policy that no update of this training has changed is none of its results: what drove iteration 0 is a network
     that has learned nothing, or the model that was cloned.
 
-    Args:
-        recording: of the service.
-        iterations: `ITERATION_COLUMNS`, those to be judged.
-
     Returns:
         `CANDIDATE_COLUMNS`.
     """

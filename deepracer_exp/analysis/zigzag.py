@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -14,6 +15,9 @@ from .sectors import sector_at, sectors_of
 from .statistics import Values
 from .step_columns import STILL_M, first_rows
 
+if TYPE_CHECKING:
+    from .log_view import LogView
+
 CENTRED_DEG = 2.0
 """Steering below which the wheels count as straight: less than the smallest angle of usual action spaces."""
 AROUND = 7
@@ -22,6 +26,19 @@ DRIVES = ("", "in_progress", "lap_complete")
 """Status of the rows in which the car drives; formats without a status have none."""
 PASS_M = 1.0
 """Rows further apart are not of one pass: the car was moved."""
+ZIGZAG_PER_M = 1.0
+"""Changes of steering a metre of straight from which on a car zig-zags: fast policies of the service's races change 0.2
+to 0.4 times, those of its first trainings 1 to 7 times."""
+ZIGZAG_DEG = 5.0
+"""Angle to either side below which nobody would see it."""
+LEAST_M = 10.0
+"""Metres of straight without which the figures say little."""
+CURE = (
+    "an action space with smaller angles; algorithm.smoothness=0.02 helps some trainings (docs/smoothness.md)"
+)
+
+Figures = tuple[float, float, float]
+"""`changes_per_m`, `amplitude_deg` (NaN without a change) and `lost_s` of a `ZigZag`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,3 +211,27 @@ def _aside(one_pass: NDArray[np.integer], bearing_rad: Values) -> Values:
     row = np.arange(count)
     mean = (sums[row + half + 1] - sums[row - half]) / (2 * half + 1)
     return unwrapped - unwrapped[0] - mean
+
+
+def zigzag_now(view: "LogView") -> tuple[Figures | None, str]:
+    """Return how the car steers on straights as it races now, and in which driving that is seen.
+
+    It is the evaluation of the best checkpoint of a run of ours, or of its last one; of a log of the service all its
+    evaluations and races. Where these have no steps it is the training now, in which actions are drawn: the policy that
+    races swerves less than that. None without enough straights.
+    """
+    tried = None if view.run is None else view.run.evaluations.dropna(subset="zigzag_per_m")
+    if view.run is not None and tried is not None and len(tried):
+        of_best = tried[tried["iteration"] == view.run.best.iteration]
+        row = (of_best if len(of_best) else tried).iloc[-1]
+        figures = row["zigzag_per_m"], row["zigzag_deg"], row["zigzag_lost_s"]
+        return figures, f"evaluation after iteration {row['iteration']:.0f}"
+    zigzag, where = zigzag_in(view.evaluation_steps, view.course), "evaluations"
+    if zigzag.straight_m < LEAST_M and view.trained:
+        episodes, when = view.now()
+        wanted = view.steps["episode"].isin(episodes["episode"]).to_numpy()
+        zigzag, where = zigzag_in(view.steps, view.course, wanted), f"while exploring, {when}"
+    if zigzag.straight_m < LEAST_M or zigzag.changes_per_m is None or zigzag.lost_s is None:
+        return None, where
+    amplitude_deg = math.nan if zigzag.amplitude_deg is None else zigzag.amplitude_deg
+    return (zigzag.changes_per_m, amplitude_deg, zigzag.lost_s), where

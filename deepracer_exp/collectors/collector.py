@@ -194,15 +194,7 @@ class LocalCollector(Collector):
         self._ask(put, lambda: "a collector worker did not restore its cars")
 
     def _ask(self, question: Callable[[], _T], silence: Callable[[], str]) -> _T:
-        """Return the workers' answer; TorchRL alone would wait for it forever, even if the worker is dead.
-
-        Args:
-            question: asks the workers.
-            silence: returns who did not answer, for the message.
-
-        Raises:
-            RunFailed: a worker is lost, or did not answer within `collector.hang_timeout_s`.
-        """
+        """Return the workers' answer; TorchRL alone would wait for it forever, even if the worker is dead."""
         answer: Future[_T] = Future()
 
         def ask() -> None:

@@ -246,11 +246,7 @@ class RayCollector(Collector):
         return TensorDict(whole, batch_size=whole["action"].shape[:2])
 
     def _ask(self, ask: Callable[[int], Any], timeout_s: float | None = None) -> list[Any]:
-        """Return the workers' answers in the order of the workers.
-
-        Raises:
-            RunFailed: the first that is lost, hangs or fails.
-        """
+        """Return the workers' answers in the order of the workers."""
         timeout_s = timeout_s or self._hang_timeout_s
         waiting = {ask(worker): worker for worker in range(len(self._cars))}
         answers: dict[int, Any] = {}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from deepracer_exp.errors import BadInput, writing
 
-from .arguments import Stores, add_command, add_overrides, complete_runs, is_override, read_stores
+from .arguments import Stores, add_command, add_run, complete_runs, read_stores, runs_and_overrides
 from .output import table_console, warnings_on_stderr
 from .pages import existing_logs
 from .tracks import ROUTES, experiment_on, search_fastest
@@ -58,11 +58,13 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         "picture.",
         epilog=_EPILOG,
     )
-    what = parser.add_argument(
-        "what", nargs="?", metavar="RUN | LOGS | TRACK", help="a run, logs of the service, or a track"
+    add_run(
+        parser,
+        "checkpoint=NAME | KEY=VALUE",
+        metavar="RUN | LOGS | TRACK",
+        help="a run, logs of the service, or a track",
+        completer=_complete,
     )
-    what.completer = _complete  # type: ignore[attr-defined]
-    add_overrides(parser, "checkpoint=NAME | KEY=VALUE")
     parser.add_argument("--count", type=_whole, default=12, metavar="N", help="actions in all (default: 12)")
     parser.add_argument(
         "--name", help="name of the option, ./conf/action_space/NAME.yaml (default: actions-SOURCE)"
@@ -79,10 +81,10 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     )
 
 
-def _whole(given: str) -> int:
-    if not given.isdecimal():
-        raise argparse.ArgumentTypeError(f"{given}: accepted: a whole number")
-    return int(given)
+def _whole(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text}: accepted: a whole number")
+    return int(text)
 
 
 def _actions(args: argparse.Namespace) -> int:
@@ -91,17 +93,17 @@ def _actions(args: argparse.Namespace) -> int:
     from deepracer_exp.config.imported_options import check_action_space_name, write_action_space
     from deepracer_exp.files import atomic_write
 
-    words = [word for word in (args.what, *args.overrides) if word is not None]
-    overrides = [word for word in words if is_override(word)]
-    given = [word for word in words if not is_override(word)]
-    if len(given) != 1:
-        raise BadInput(f"{' '.join(given) or 'RUN'}: {len(given)} given; accepted: one run, logs or a track")
+    sources, overrides = runs_and_overrides(args)
+    if len(sources) != 1:
+        raise BadInput(
+            f"{' '.join(sources) or 'RUN'}: {len(sources)} given; accepted: one run, logs or a track"
+        )
     check_count(args.count)
     if args.name is not None:
         check_action_space_name(args.name)
         _check_folder(args.output or args.name)
 
-    source = _source(given[0], overrides, args.track)
+    source = _source(sources[0], overrides, args.track)
     name = args.name or _default_name(source.name)
     folder = _check_folder(args.output or name)
     check_action_space_name(name)
@@ -127,11 +129,7 @@ def _actions(args: argparse.Namespace) -> int:
 
 
 def _check_folder(output: str) -> Path:
-    """Return the folder to write to.
-
-    Raises:
-        BadInput: it has one of the files already.
-    """
+    """Return the folder to write to."""
     folder = Path(output).expanduser()
     for name in (METADATA, PICTURE):
         if os.path.lexists(folder / name):
@@ -185,7 +183,7 @@ def _of_track(what: str, is_route: bool, overrides: list[str], track: str | None
     from deepracer_exp.config.overrides import group_of, override_line
     from deepracer_exp.export.aws_files import services_metadata
 
-    free = [] if any(group_of(one) == "action_space" for one in overrides) else FREE
+    free = [] if any(group_of(override) == "action_space" for override in overrides) else FREE
     named = override_line("track.file" if is_route else "track", what)
     experiment, course = experiment_on([named, *free, *overrides])
     lap = search_fastest(experiment, course)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from deepracer_exp.errors import BadInput, count, writing
 from deepracer_exp.runs.files import REPORT
 
-from .arguments import add_command, add_overrides, complete_runs, is_override, read_stores
+from .arguments import add_command, add_run, read_stores, runs_and_overrides
 from .output import check_file
 from .pages import add_page, add_replay, end_with_page, page_name, run_or_logs, write_laps
 
@@ -42,9 +42,9 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         epilog=_EPILOG,
         runs_rewards=True,
     )
-    what = parser.add_argument("what", nargs="?", metavar="RUN | LOGS", help="a run, or logs of the service")
-    what.completer = complete_runs  # type: ignore[attr-defined]
-    add_overrides(parser, "runs_dir=DIR | tracking.uri=URI")
+    add_run(
+        parser, "runs_dir=DIR | tracking.uri=URI", metavar="RUN | LOGS", help="a run, or logs of the service"
+    )
     parser.add_argument(
         "--reward",
         metavar="NAME | FILE",
@@ -71,9 +71,8 @@ def _analyze(args: argparse.Namespace) -> int:
 
     target_s = None if args.target is None else _seconds(args.target)
 
-    words = [word for word in (args.what, *args.overrides) if word is not None]
-    stores = read_stores(word for word in words if is_override(word))
-    logs = [word for word in words if not is_override(word)]
+    logs, overrides = runs_and_overrides(args)
+    stores = read_stores(overrides)
     if len(logs) != 1:
         more = "; deepracer-exp compare takes several" * (len(logs) > 1)
         raise BadInput(f"{' '.join(logs) or 'RUN'}: {len(logs)} runs or logs given; accepted: one{more}")
@@ -117,9 +116,9 @@ def _analyze(args: argparse.Namespace) -> int:
     replay = None if reward is None else replay_reward(view, reward, car)
     default = place / REPORT if is_traced_run(place) else page_name("analysis", view.name)
     out = Path(args.output or default)
-    found = findings(view, target_s)
+    sentences = findings(view, target_s)
     with writing(f"--output {out}", "a file in a folder"):
-        write_log_page(out, LogPage(view, found, replay, terms, strip))
+        write_log_page(out, LogPage(view, sentences, replay, terms, strip))
     if laps is not None:
         write_laps(args.replay, laps)
     if line is not None:
@@ -130,8 +129,8 @@ def _analyze(args: argparse.Namespace) -> int:
     several = trainings(view)
     if several is not None:
         print(f"     trainings in it: {several}. One alone: give its files in a folder of their own")
-    for number, one in enumerate(found, 1):
-        print(f"{number:3d}  {one.sentence}")
+    for number, finding in enumerate(sentences, 1):
+        print(f"{number:3d}  {finding.sentence}")
     for sentence in replay.sentences if replay is not None else ():
         print(f"     {sentence}")
     if view.problems:
@@ -178,11 +177,7 @@ def _seconds(text: str) -> float:
 
 
 def _find_fastest(view: "LogView", place: Path) -> None:
-    """Search for the fastest lap of a run's car, unless an earlier search has kept it.
-
-    Raises:
-        BadInput: it is no run of ours, or its car and track are unknown.
-    """
+    """Search for the fastest lap of a run's car, unless an earlier search has kept it."""
     from deepracer_exp.analysis.against_fastest import question_of
     from deepracer_exp.runs.recording import is_traced_run
 

@@ -42,16 +42,24 @@ def add_command(
     return parser
 
 
-def add_run(parser: argparse.ArgumentParser, overrides: str | None = "KEY=VALUE", many: bool = False) -> None:
+def add_run(
+    parser: argparse.ArgumentParser,
+    overrides: str = "KEY=VALUE",
+    *,
+    many: bool = False,
+    metavar: str = "RUN",
+    help: str = RUN,
+    completer: Callable[..., list[str]] | None = None,
+) -> None:
     """Give a command the arguments `RUN [overrides]`, which `run_and_overrides` returns."""
-    run = parser.add_argument("runs", nargs="*" if many else "?", metavar="RUN", help=RUN)
-    run.completer = complete_runs  # type: ignore[attr-defined]
+    run = parser.add_argument("runs", nargs="*" if many else "?", metavar=metavar, help=help)
+    run.completer = completer or complete_runs  # type: ignore[attr-defined]
     add_overrides(parser, overrides, complete_runs)
 
 
 def add_overrides(
     parser: argparse.ArgumentParser,
-    metavar: str | None = "KEY=VALUE",
+    metavar: str = "KEY=VALUE",
     completer: Callable[..., list[str]] | None = None,
 ) -> None:
     """Give a command overrides in Hydra's grammar."""
@@ -59,15 +67,15 @@ def add_overrides(
     action.completer = completer or complete_overrides  # type: ignore[attr-defined]
 
 
-def port(given: str) -> int:
+def port(text: str) -> int:
     """Return the value of `--port`.
 
     Raises:
         ArgumentTypeError: it is no port.
     """
-    if not given.isdecimal() or not 0 < int(given) < 65536:
-        raise argparse.ArgumentTypeError(f"{given}: accepted: 1 to 65535")
-    return int(given)
+    if not text.isdecimal() or not 0 < int(text) < 65536:
+        raise argparse.ArgumentTypeError(f"{text}: accepted: 1 to 65535")
+    return int(text)
 
 
 def runs_and_overrides(args: argparse.Namespace) -> tuple[list[str], list[str]]:
@@ -76,11 +84,11 @@ def runs_and_overrides(args: argparse.Namespace) -> tuple[list[str], list[str]]:
     Raises:
         BadInput: a run is given as `run=RUN`.
     """
-    given = _words(args)
-    for word in given:
+    words = _words(args)
+    for word in words:
         if word.startswith("run="):
             raise BadInput(f"{word}: write {args.prog} {shlex.quote(word.removeprefix('run='))}")
-    return [word for word in given if not is_override(word)], [word for word in given if is_override(word)]
+    return [word for word in words if not is_override(word)], [word for word in words if is_override(word)]
 
 
 def _words(args: argparse.Namespace) -> list[str]:
@@ -128,9 +136,7 @@ class Stores:
 def read_stores(overrides: Iterable[str], keys: Sequence[str] = ()) -> Stores:
     """Read the overrides of a command that composes no configuration.
 
-    Args:
-        overrides: `KEY=VALUE`, the last of several with the same key counts.
-        keys: that are accepted besides `STORES`.
+    The last of several with the same key counts; `keys` are accepted besides `STORES`.
 
     Raises:
         BadInput: another key, or a word that is no override.
@@ -143,11 +149,11 @@ def read_stores(overrides: Iterable[str], keys: Sequence[str] = ()) -> Stores:
             raise BadInput(f"{word}: no such key{nearest(key, accepted)}; accepted: {', '.join(accepted)}")
         quoted = len(value) > 1 and value[0] == value[-1] and value[0] in "'\""
         values[key] = value[1:-1] if quoted else value
-    given = {key: value for key, value in values.items() if value not in ("", "null")}
-    text = given.pop("runs_dir", "runs")
+    chosen = {key: value for key, value in values.items() if value not in ("", "null")}
+    text = chosen.pop("runs_dir", "runs")
     with reading(f"runs_dir={text}"):
         runs_dir = Path(text).expanduser()
-    return Stores(runs_dir, given.pop("tracking.uri", None), given)
+    return Stores(runs_dir, chosen.pop("tracking.uri", None), chosen)
 
 
 def split_stores(overrides: Iterable[str]) -> tuple[Stores, list[str]]:
@@ -170,11 +176,11 @@ def complete_overrides(prefix: str, parsed_args: argparse.Namespace, **_: Any) -
     from deepracer_exp.config.options import groups, options
 
     entry = getattr(parsed_args, "entry", "train")
-    known = [] if entry is None else groups(entry)
+    names = [] if entry is None else groups(entry)
     group, equals, _value = prefix.partition("=")
     if equals:
-        return [f"{group}={name}" for name in options(group)] if group in known else []
-    return [f"{name}=" for name in known]
+        return [f"{group}={name}" for name in options(group)] if group in names else []
+    return [f"{name}=" for name in names]
 
 
 def complete_groups(**_: Any) -> list[str]:

@@ -1,16 +1,31 @@
 """`deepracer-exp compare`: runs, groups of runs over seeds, and logs of the service, beside each other."""
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from deepracer_exp.errors import BadInput, count
-from deepracer_exp.runs.files import CONFIG, is_run
+from deepracer_exp.errors import BadInput, count, writing
+from deepracer_exp.runs.files import CONFIG, TRACE, is_run
 
 from .arguments import STORES, Stores, add_command, add_run, read_stores, runs_and_overrides
-from .compare_logs import CHECKPOINT, against_log, compare_recordings
 from .compare_runs import compare_runs
-from .output import check_file
-from .pages import Item, add_page, add_replay, existing_logs, run_or_logs
+from .output import check_file, print_table, table_console, warnings_on_stderr
+from .pages import (
+    Item,
+    add_page,
+    add_replay,
+    end_with_page,
+    existing_logs,
+    find_run,
+    light,
+    page_name,
+    write_comparison_page,
+    write_laps,
+)
+
+if TYPE_CHECKING:
+    from deepracer_exp.analysis.log_view import LogView
 
 _EPILOG = """\
   deepracer-exp compare RUN RUN                             how two runs differ, and what each achieved
@@ -66,22 +81,22 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
 def _compare(args: argparse.Namespace) -> int:
     from deepracer_exp.config.own_class import allow_given
 
-    given, overrides = runs_and_overrides(args)
-    keys = (*STORES, CHECKPOINT)
-    own = [word for word in overrides if word.partition("=")[0] in keys or "." in word.partition("=")[0]]
-    stores = read_stores(allow_given(own), [CHECKPOINT])
+    words, pairs = runs_and_overrides(args)
+    keys = (*STORES, "checkpoint")
+    overrides = [pair for pair in pairs if (key := pair.partition("=")[0]) in keys or "." in key]
+    groups = [pair for pair in pairs if pair not in overrides]
+    stores = read_stores(allow_given(overrides), ["checkpoint"])
     check_file("--output", args.output)
     check_file("--replay", args.replay, ".html")
-    items = [_item(word, None, stores) for word in given]
-    for word in overrides:
-        if word not in own:
-            name, _, members = word.partition("=")
-            items += [_item(member, name, stores) for member in members.split(",")]
+    items = [_item(word, None, stores) for word in words]
+    for group in groups:
+        name, _, members = group.partition("=")
+        items += [_item(member, name, stores) for member in members.split(",")]
     logs = [item for item in items if item.is_logs]
     runs = list(dict.fromkeys(path.resolve() for item in items if not item.is_logs for path in item.paths))
     if len(runs) + len(logs) < 2:
         raise BadInput(
-            f"{' '.join([*given, *(word for word in overrides if word not in own)]) or 'RUN RUN'}: "
+            f"{' '.join([*words, *groups]) or 'RUN RUN'}: "
             f"{count(len(runs), 'run')} and {count(len(logs), 'log')}; accepted: two or more that differ, or an "
             "experiment or a study with several runs"
         )
@@ -90,27 +105,106 @@ def _compare(args: argparse.Namespace) -> int:
     if logs and args.format != "table":
         raise BadInput(f"--format {args.format}: accepted with runs only; {logs[0].word} is a log")
     one_of_each = len(runs) == len(logs) == 1
-    if CHECKPOINT in stores.values and not one_of_each:
-        raise BadInput(f"checkpoint={stores.values[CHECKPOINT]}: accepted with one run and one log")
+    if "checkpoint" in stores.values and not one_of_each:
+        raise BadInput(f"checkpoint={stores.values['checkpoint']}: accepted with one run and one log")
     if one_of_each:
-        (name,) = [item.word for item in items if not item.is_logs]
-        return against_log(args, name, logs[0].paths[0], stores)
-    return compare_recordings(args, items) if logs else compare_runs(args, items)
+        (item,) = (item for item in items if not item.is_logs)
+        return _against_log(args, item, logs[0].paths[0], stores.values.get("checkpoint"))
+    return _compare_recordings(args, items) if logs else compare_runs(args, items)
 
 
 def _item(word: str, group: str | None, stores: Stores) -> Item:
-    """Find what a word means: a run, an experiment or study, or logs.
-
-    Raises:
-        BadInput: it is none of them, or an experiment without a run.
-    """
+    """Find what a word means: a run, an experiment or study, or logs."""
     path = existing_logs(word)
-    if path is not None and is_run(path):
-        return Item(word, group, (path,))
-    folders = [path] if path is not None else []
-    if Path(word).name == word:
-        folders.append(stores.runs_dir / word)
-    for folder in folders:
-        if members := sorted(file.parent for file in folder.glob(f"[!.]*/{CONFIG}")):
-            return Item(word, group, tuple(members), True)
-    return Item(word, group, (run_or_logs(word, stores),))
+    if path is None or not is_run(path):
+        folders = [path] if path is not None else []
+        if Path(word).name == word:
+            folders.append(stores.runs_dir / word)
+        for folder in folders:
+            if members := sorted(file.parent for file in folder.glob(f"[!.]*/{CONFIG}")):
+                return Item(word, group, tuple(members), True)
+        if path is not None:
+            return Item(word, group, (path,))
+    run = find_run(word, stores)
+    return Item(word, group, (run.path,), run=run)
+
+
+def _compare_recordings(args: argparse.Namespace, items: Sequence[Item]) -> int:
+    """Compare how logs, and runs among them, learned."""
+    from deepracer_exp.analysis.charts.runs import (
+        generalisation_matrix,
+        generations,
+        policy_of,
+        recordings_compared,
+    )
+    from deepracer_exp.analysis.log_tables import Table, headline
+    from deepracer_exp.analysis.log_view import prepare
+    from deepracer_exp.reports.lap_replay import laps_of_log
+    from deepracer_exp.runs.recording import read_log
+
+    named: list[tuple[str | None, LogView]] = []
+    whole: list[LogView] = []
+    for item in items:
+        for path in item.paths:
+            view = prepare(read_log(path), args.track)
+            whole += [view] * (args.replay is not None)
+            named.append((item.group, light(view)))
+    views = [view for _, view in named]
+    charts = [
+        recordings_compared(named),
+        generations(views),
+        generalisation_matrix(list(map(policy_of, views))),
+    ]
+    table = Table(("recording", "driven"), tuple((view.name, headline(view)) for view in views), 2)
+    notes = ["Logs know the laps of the training only, driven by a policy that explores."]
+    out = write_comparison_page(args.output, items, notes, [("Recordings", table, "")], charts)
+    if args.replay is not None:
+        write_laps(args.replay, laps_of_log(whole[0], whole[1]))
+    print_table(table_console(), "Recordings", table)
+    print(notes[0])
+    end_with_page(out, args.open)
+    if args.replay is not None:
+        print(f"  laps  {args.replay}")
+    return 0
+
+
+def _against_log(args: argparse.Namespace, item: Item, place: Path, checkpoint: str | None) -> int:
+    """Race a policy as the laps of a log were driven; draw how both learned where the log has a training."""
+    from deepracer_exp.lookup.resolve import StoredRun
+
+    run = (item.run or StoredRun(item.paths[0])).with_policy(checkpoint)
+
+    from deepracer_exp.analysis.charts.runs import recordings_compared
+    from deepracer_exp.analysis.log_view import prepare, prepare_races
+    from deepracer_exp.aws.logs.reader import read_recording
+    from deepracer_exp.reports.against_log import write_against_log
+    from deepracer_exp.reports.lap_replay import laps_of_log
+    from deepracer_exp.runs.recording import read_log
+
+    recording = read_recording(place)
+    view = prepare_races(recording, args.track)
+
+    from rich.console import Console
+
+    from deepracer_exp.reports.driven_against_log import race_against_log
+
+    with warnings_on_stderr():
+        both = race_against_log(run, view, args.track, Console(stderr=True, highlight=False))
+    learned = None
+    if (run.path / TRACE).is_dir() and (args.replay is not None or prepare(recording, args.track).trained):
+        views = [prepare(read_log(run.path)), prepare(recording, args.track)]
+        learned = recordings_compared([(None, light(side)) for side in views])
+        if args.replay is not None:
+            write_laps(args.replay, laps_of_log(*views))
+    out = Path(args.output or page_name("comparison", view.name))
+    with writing(f"--output {out}", "a file in a folder"):
+        write_against_log(out, run.path.name, both, view, learned)
+
+    console, texts = table_console(), both.texts
+    console.print(f"log        {view.name}: {both.logged.words}", soft_wrap=True)
+    console.print(f"simulated  {run.path.name}: {both.simulated.words}\n", soft_wrap=True)
+    print_table(console, None, texts)
+    for sentence in both.sentences:
+        console.print(sentence, soft_wrap=not console.is_terminal)
+    end_with_page(out, args.open)
+    return 0

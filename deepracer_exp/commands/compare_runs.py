@@ -68,15 +68,15 @@ def _groups(items: Sequence[Item]) -> "list[RunGroup]":
     from deepracer_exp.analysis.groups import RunGroup, group_runs
     from deepracer_exp.runs.files import read_record
 
-    known: dict[Path, RunRecord] = {}
+    records: dict[Path, RunRecord] = {}
 
     def read(path: Path) -> "RunRecord":
         key = path.resolve()
-        if key not in known:
-            known[key] = read_record(path)
-            if not known[key].rows:
+        if key not in records:
+            records[key] = read_record(path)
+            if not records[key].rows:
                 raise BadInput(f"{path / METRICS}: has no iteration; there is nothing to compare")
-        return known[key]
+        return records[key]
 
     several = len({item.word for item in items if item.is_experiment and item.group is None}) > 1
     pools: dict[str, list[tuple[str | None, RunRecord]]] = {}
@@ -92,12 +92,13 @@ def _groups(items: Sequence[Item]) -> "list[RunGroup]":
                 pairs.append(pair)
     groups: list[RunGroup] = []
     for pool, pairs in pools.items():
-        own = group_runs(pairs)
+        named = group_runs(pairs)
         if pool:
-            own = [
-                RunGroup(pool if len(own) == 1 else f"{pool}: {group.name}", group.records) for group in own
+            named = [
+                RunGroup(pool if len(named) == 1 else f"{pool}: {group.name}", group.records)
+                for group in named
             ]
-        groups += own
+        groups += named
     return groups
 
 
@@ -107,8 +108,8 @@ def _best(groups: "list[RunGroup]") -> "list[RunGroup]":
         return groups
 
     def score_s(group: "RunGroup") -> float:
-        found = group.estimate("race_score_s")
-        return float("inf") if found is None else found.iqm
+        estimate = group.estimate("race_score_s")
+        return float("inf") if estimate is None else estimate.iqm
 
     return sorted(groups, key=score_s)[:_MOST_GROUPS]
 
@@ -133,11 +134,11 @@ def _show(
         groups = [RunGroup(f"{letter}  {group.name}", group.records) for letter, group in letters.items()]
         notes = ["Each run is alone: nothing says how much of a difference is chance. Train more seeds."]
     else:
-        found = compared(groups)
-        notes = sentences(groups, found)
+        differences = compared(groups)
+        notes = sentences(groups, differences)
         tables.append(("Groups", scored(groups), _SCORED))
-        if found:
-            tables.append((f"Against {groups[0].name}", differences_table(found), _DIFFERENCES))
+        if differences:
+            tables.append((f"Against {groups[0].name}", differences_table(differences), _DIFFERENCES))
     if of_all > len(groups):
         notes.append(f"{of_all} groups: shown are the {len(groups)} with the best race score.")
     shown = [record for group in groups for record in group.records]
@@ -146,7 +147,9 @@ def _show(
         *learning_curve_charts(groups),
         best_checkpoints(groups),
         _generations(shown),
-        generalisation_matrix([(one.name, course_of(one), stored_completion(one.path)) for one in shown]),
+        generalisation_matrix(
+            [(record.name, course_of(record), stored_completion(record.path)) for record in shown]
+        ),
     ]
     out = write_comparison_page(args.output, items, notes, tables, charts)
     if args.format == "table":
@@ -182,8 +185,8 @@ def _run_tables(groups: "Sequence[RunGroup]") -> "list[tuple[str, Table, str]]":
             (_RUNS, Table(("", "run"), tuple(named), 2), ""),
             ("Results", Table(("", *heads), tuple(achieved), 1), ""),
         ]
-    found = run_differences(records[: len(heads)]).items()
-    chosen = [(key, *map(value_text, values)) for key, values in found if key not in ignored]
+    differences = run_differences(records[: len(heads)]).items()
+    chosen = [(key, *map(value_text, values)) for key, values in differences if key not in ignored]
     table = Table(("", *heads), tuple(chosen), 1 + len(heads))
     return [*tables, ("Configuration", table, "" if chosen else "No difference.")]
 
@@ -201,6 +204,8 @@ def _generations(records: "Sequence[RunRecord]") -> "Chart | None":
     if not family:
         return None
     try:
-        return generations([light(prepare(read_log(one.path))) for one in records if one.name in family])
+        return generations(
+            [light(prepare(read_log(record.path))) for record in records if record.name in family]
+        )
     except BadInput:  # a trace was removed
         return None

@@ -142,7 +142,7 @@ def _planned(
 
 
 def _checkpoints_given(args: argparse.Namespace) -> list[str]:
-    return [given for given in runs_and_overrides(args)[1] if given.startswith("checkpoint=")]
+    return [override for override in runs_and_overrides(args)[1] if override.startswith("checkpoint=")]
 
 
 _WATCH_EPILOG = """\
@@ -299,8 +299,8 @@ def _replay(args: argparse.Namespace) -> int:
     from deepracer_exp.config.compose import compose_experiment, expand_grid
     from deepracer_exp.runs.files import read_record
 
-    runs, given = runs_and_overrides(args)
-    stores, overrides = split_stores(given)
+    runs, words = runs_and_overrides(args)
+    stores, overrides = split_stores(words)
     for override in overrides:
         if not override.startswith(("stopping=", "stopping.")):
             raise BadInput(f"{override}: accepted: stopping=NAME and stopping.KEY=VALUE")

@@ -165,14 +165,14 @@ def _export(args: argparse.Namespace) -> int:
             "missing; write format=onnx, format=aws, format=aws-model, format=aws-logs, or, for a policy that sees "
             "with the camera, format=car",
         )
-    given = {key: stores.values.get(key, accepted[0]) for key, accepted in _EXPORTED.items()}
-    for key, value in given.items():
+    chosen = {key: stores.values.get(key, accepted[0]) for key, accepted in _EXPORTED.items()}
+    for key, value in chosen.items():
         if value not in _EXPORTED[key]:
             raise BadInput(f"{key}={value}", f"no such {key}", ", ".join(_EXPORTED[key]))
     run = stores.find(name)
-    if given["format"] in ("onnx", "car", "aws-model"):
+    if chosen["format"] in ("onnx", "car", "aws-model"):
         run = run.with_policy(stores.values.get("checkpoint"))
-    if given["format"] == "car":
+    if chosen["format"] == "car":
         from deepracer_exp.env.real_car import check_car
 
         check_car(run.experiment)
@@ -182,7 +182,7 @@ def _export(args: argparse.Namespace) -> int:
     from deepracer_exp.export.export import export
 
     with warnings_on_stderr():
-        export(run, **given, output=args.output, out=Console(highlight=False, markup=False))
+        export(run, **chosen, output=args.output, out=Console(highlight=False, markup=False))
     return 0
 
 
@@ -223,17 +223,13 @@ def _validate(args: argparse.Namespace) -> int:
     return validate_reward(plan, trial, args.output, args.strict, Console(), Console(stderr=True))
 
 
-def _trial_overrides(given: str) -> list[str]:
-    """Return the overrides for a training of `trial=60s`, `trial=2min` or `trial=90`; its run goes to `runs/validate/`.
-
-    Raises:
-        BadInput: it is none of them.
-    """
-    match = re.fullmatch(r"trial=(\d+(?:\.\d+)?)(s|min)?", given)
+def _trial_overrides(word: str) -> list[str]:
+    """Return the overrides for a training of `trial=60s`, `trial=2min` or `trial=90`; its run is in `runs/validate`."""
+    match = re.fullmatch(r"trial=(\d+(?:\.\d+)?)(s|min)?", word)
     seconds = float(match[1]) * (60 if match[2] == "min" else 1) if match else 0.0
     if not seconds:
         raise BadInput(
-            f"{given}: not a time; accepted: seconds or minutes above 0, e.g. trial=60s, trial=2min"
+            f"{word}: not a time; accepted: seconds or minutes above 0, e.g. trial=60s, trial=2min"
         )
     return [
         *("name=validate", "tracking=off", "stopping=none", "checkpoints.every=null"),

@@ -136,12 +136,12 @@ def print_result(outcome: "TrainResult", tracking: "TrackingConfig") -> None:
 def _reliable_lap(run: Path) -> str:
     """Return the fastest reliable lap of a run's evaluated policies in words, and whether its checkpoint is there."""
     rows = read_metrics(run / METRICS)
-    found = fastest_reliable(rows)
-    if found is None:
+    lap = fastest_reliable(rows)
+    if lap is None:
         share = max((row.get("eval_lap_share") or 0.0 for row in rows), default=0.0)
         return f"none yet; {RELIABLE:.0%} of the usual laps must be complete, at best {share:.0%} were"
-    kept = (run / CHECKPOINTS / f"{found.iteration:06d}").is_dir()
-    return f"{found}" if kept else f"{found} (not kept; checkpoints.metric=reliable_lap keeps it)"
+    kept = (run / CHECKPOINTS / f"{lap.iteration:06d}").is_dir()
+    return f"{lap}" if kept else f"{lap} (not kept; checkpoints.metric=reliable_lap keeps it)"
 
 
 def print_steps(steps: Sequence[tuple[str, str]]) -> None:
@@ -176,12 +176,12 @@ def _print_groups(runs: "Sequence[Path]") -> None:
     groups = group_runs((None, read_head(run)) for run in runs) if len(runs) > 1 else []
     if len(groups) in (0, len(runs)):
         return
-    console, found = table_console(), compared(groups)
+    console, differences = table_console(), compared(groups)
     console.print()
     print_table(console, "Groups", scored(groups))
-    if found:
-        print_table(console, f"Against {groups[0].name}", differences_table(found))
-    for sentence in sentences(groups, found):
+    if differences:
+        print_table(console, f"Against {groups[0].name}", differences_table(differences))
+    for sentence in sentences(groups, differences):
         console.print(sentence, soft_wrap=True)
     words = shlex.join(own_word(run) for run in runs)
     print_steps([(f"{_command()} compare {words}", "learning curves over seeds")])
@@ -192,11 +192,11 @@ def _print_unrecorded(outcomes: "Sequence[TrainResult]", tracking: "TrackingConf
     from deepracer_exp.config.running import MLflowTracking
     from deepracer_exp.lookup.next_steps import own_word
 
-    lacking = [one for one in outcomes if one.unrecorded is not None]
-    for reason in dict.fromkeys(one.unrecorded for one in lacking):
+    lacking = [outcome for outcome in outcomes if outcome.unrecorded is not None]
+    for reason in dict.fromkeys(outcome.unrecorded for outcome in lacking):
         print(f"\nwarning: {reason}", file=sys.stderr)
     if lacking and isinstance(tracking, MLflowTracking):
-        words = shlex.join(own_word(one.folder) for one in lacking)
+        words = shlex.join(own_word(outcome.folder) for outcome in lacking)
         store = _store_word(lacking[0].folder.parent.parent, tracking.uri)
         print(
             f"  the run folder has everything; send it later: {_command()} runs send {words}{store}",
@@ -212,10 +212,10 @@ def print_unsent(study: "Path") -> None:
 
     runs_dir = study.parent
     stores = list(undelivered(sorted(file.parent for file in study.glob(f"*/{CONFIG}"))).values())
-    own = resolve_store(None, runs_dir).shown
+    usual = resolve_store(None, runs_dir).shown
     for store in dict.fromkeys(stores):
         words = [f"runs_dir={runs_dir}"] * (str(runs_dir) != "runs") + [f"tracking.uri={store}"] * (
-            store != own
+            store != usual
         )
         command = shlex.join([_command(), "runs", "send", *words])
         print(
@@ -240,8 +240,8 @@ def _lap(outcome: "TrainResult") -> str:
     """Return the fastest reliable lap of a run's evaluated policies, or what exploration did if there is none."""
     # A run that failed in its first iteration has no metrics.
     file = outcome.folder / METRICS
-    found = fastest_reliable(read_metrics(file)) if file.is_file() else None
-    return f"exploring: {_laps(outcome.summary)}" if found is None else f"fastest reliable lap: {found}"
+    lap = fastest_reliable(read_metrics(file)) if file.is_file() else None
+    return f"exploring: {_laps(outcome.summary)}" if lap is None else f"fastest reliable lap: {lap}"
 
 
 def _laps(summary: Mapping[str, Any]) -> str:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from deepracer_exp.analysis.charts.figure import Chart
     from deepracer_exp.analysis.log_tables import Table
     from deepracer_exp.analysis.log_view import LogView
+    from deepracer_exp.lookup.resolve import StoredRun
     from deepracer_exp.reports.lap_replay import ReplayedLap
 
 _ACCEPTED = "logs of the service, or a run"
@@ -89,12 +90,17 @@ def run_or_logs(what: str, stores: Stores) -> Path:
     Raises:
         BadInput: there is none, or the name of a run is ambiguous.
     """
-    path = existing_logs(what)
-    if path is not None:
-        return path
+    return existing_logs(what) or find_run(what, stores).path
 
+
+def find_run(what: str, stores: Stores) -> "StoredRun":
+    """Return the run that a word names, which is no file or folder.
+
+    Raises:
+        BadInput: there is none, or its name is ambiguous.
+    """
     try:
-        return stores.find(what).path
+        return stores.find(what)
     except BadInput as error:
         raise BadInput(what, f"no such file or folder, and no run: {error.without(what)}") from None
 
@@ -109,6 +115,8 @@ class Item:
     paths: tuple[Path, ...]
     """Folders of runs, or one file or folder of logs."""
     is_experiment: bool = False
+    run: "StoredRun | None" = None
+    """The run, if the word names one, with the checkpoint of an alias."""
 
     @property
     def is_logs(self) -> bool:

@@ -258,18 +258,18 @@ def _clean(args: argparse.Namespace) -> int:
     overview, note = _overview(stores.uri, runs_dir)
     if note is not None:
         print(note, file=sys.stderr)
-    found = survey(runs_dir, overview)
-    removable = [*found.removable, *asked_traces(found.offered, args.traces)]
+    clutter = survey(runs_dir, overview)
+    removable = [*clutter.removable, *asked_traces(clutter.offered, args.traces)]
     _show_removable(removable, runs_dir, console)
-    for reason in dict.fromkeys(reason for _, reason in found.kept):
-        runs = [str(run.relative_to(runs_dir)) for run, given in found.kept if given == reason]
+    for reason in dict.fromkeys(reason for _, reason in clutter.kept):
+        runs = [str(run.relative_to(runs_dir)) for run, why in clutter.kept if why == reason]
         more = f" and {len(runs) - 1} more" * (len(runs) > 1)
         console.print(f"kept: {runs[0]}{more}: {reason}", soft_wrap=True)
-    if args.traces is None and found.offered:
-        short = asked_traces(found.offered, THIN)
+    if args.traces is None and clutter.offered:
+        short = asked_traces(clutter.offered, THIN)
         print(
-            f"offered: the traces of {count(len(found.offered), 'finished run')}: --traces drop removes "
-            f"{decimal(total_bytes(found.offered))}, --traces thin {decimal(total_bytes(short))}"
+            f"offered: the traces of {count(len(clutter.offered), 'finished run')}: --traces drop removes "
+            f"{decimal(total_bytes(clutter.offered))}, --traces thin {decimal(total_bytes(short))}"
         )
     if not removable:
         print("nothing to remove")

@@ -77,9 +77,9 @@ def _list(args: argparse.Namespace) -> int:
         rows = [row for row in rows if holds(row)]
     if args.sort is not None:
         _check_column(f"--sort {args.sort}", args.sort, columns)
-        known = [row for row in rows if row.get(args.sort) is not None]
-        known.sort(key=lambda row: row[args.sort])
-        rows = [*known, *(row for row in rows if row.get(args.sort) is None)]
+        valued = [row for row in rows if row.get(args.sort) is not None]
+        valued.sort(key=lambda row: row[args.sort])
+        rows = [*valued, *(row for row in rows if row.get(args.sort) is None)]
     if args.reverse:
         rows.reverse()
     if args.format == "json":
@@ -116,10 +116,10 @@ def _check_column(what: str, column: str, columns: Sequence[str]) -> None:
 
 
 def _condition(text: str, columns: Sequence[str]) -> "Callable[[Row], bool]":
-    found = _CONDITION.fullmatch(text)
-    if found is None:
+    match = _CONDITION.fullmatch(text)
+    if match is None:
         raise BadInput(f"--where {text}: accepted: COLUMN=VALUE, also with !=, <, <=, >, >= and ~ (contains)")
-    column, sign, wanted = found.groups()
+    column, sign, wanted = match.groups()
     _check_column(f"--where {text}", column, columns)
     if sign in _ORDERS and column != "began":
         try:

@@ -104,7 +104,7 @@ def _list_tracks() -> None:
     table.add_column("variants", overflow="fold")
     for name in leaders():
         world = worlds()[name]
-        others = [one for one in worlds().values() if one.family == world.family and one.name != name]
+        others = [other for other in worlds().values() if other.family == world.family and other.name != name]
         length_m, width_m = _measures(name)
         table.add_row(
             name,
@@ -112,7 +112,7 @@ def _list_tracks() -> None:
             f"{length_m:.2f}",
             f"{width_m:.2f}",
             str(world.rows),
-            " ".join(one.name.replace(one.family, "…", 1) for one in others),
+            " ".join(other.name.replace(other.family, "…", 1) for other in others),
         )
     for name in options("track"):
         if name not in worlds():

@@ -4,6 +4,7 @@ import argparse
 import shlex
 import sys
 import traceback
+from typing import TYPE_CHECKING
 
 from deepracer_exp.collectors.forking import start_workers_early
 from deepracer_exp.errors import BadInput, reading
@@ -26,6 +27,11 @@ from .output import (
     print_unsent,
     warnings_on_stderr,
 )
+
+if TYPE_CHECKING:
+    from optuna.study import Study
+
+    from deepracer_exp.training.plan import ResumePlan, TrainPlan
 
 _TRAIN_EPILOG = """\
 An experiment is one option of each group, and any value in it can be set:
@@ -169,20 +175,24 @@ or money or one that several runs share. A reward function that keeps something 
 def _resume(args: argparse.Namespace) -> int:
     from deepracer_exp.training.plan import plan_resume
 
-    name, given = run_and_overrides(args)
-    stores, changes = split_stores(given)
+    name, words = run_and_overrides(args)
+    stores, changes = split_stores(words)
     # The folder says where the run is, but MLflow may have moved.
-    overrides = [*changes, *(one for one in given if one.startswith("tracking.uri="))]
-    plan = plan_resume(stores.find(name).path, overrides)
+    overrides = [*changes, *(word for word in words if word.startswith("tracking.uri="))]
+    return _continue(plan_resume(stores.find(name).path, overrides))
+
+
+def _continue(plan: "ResumePlan | TrainPlan") -> int:
+    """Resume a run, or train a clone."""
     print_start()
     start_workers_early(plan.experiment.collector.forks)
 
     from rich.console import Console
 
-    from deepracer_exp.training.run import resume_training
+    from deepracer_exp.training.run import run_training
 
     with warnings_on_stderr():
-        outcome = resume_training(plan, Console(stderr=True))
+        outcome = run_training(plan, Console(stderr=True))
     print_result(outcome, plan.experiment.tracking)
     return outcome.exit_code
 
@@ -202,24 +212,15 @@ cannot be changed. `deepracer-exp runs lineage RUN` draws the family tree.
 def _clone(args: argparse.Namespace) -> int:
     from deepracer_exp.training.clone import plan_clone
 
-    name, given = run_and_overrides(args)
-    checkpoints = [one.partition("=")[2] for one in given if one.startswith("checkpoint=")]
-    changes = [one for one in given if not one.startswith("checkpoint=")]
+    name, words = run_and_overrides(args)
+    checkpoints = [word for word in words if word.startswith("checkpoint=")]
+    changes = [word for word in words if word not in checkpoints]
+    checkpoint = checkpoints[-1].partition("=")[2] if checkpoints else None
     parent = split_stores(changes)[0].find(name)
-    plan = plan_clone(parent.with_checkpoint(checkpoints[-1] if checkpoints else None), changes)
+    plan = plan_clone(parent.with_checkpoint(checkpoint), changes)
     args.debug = plan.experiment.debug
     print_notes((*plan.composition.notes, *plan.files.remarks))
-    print_start()
-    start_workers_early(plan.experiment.collector.forks)
-
-    from rich.console import Console
-
-    from deepracer_exp.training.run import run_training
-
-    with warnings_on_stderr():
-        outcome = run_training(plan, Console(stderr=True))
-    print_result(outcome, plan.experiment.tracking)
-    return outcome.exit_code
+    return _continue(plan)
 
 
 _SWEEP_EPILOG = """\
@@ -279,7 +280,7 @@ def _sweep(args: argparse.Namespace) -> int:
     with warnings_on_stderr():
         study, folder, code = sweep(plan, Console(stderr=True))
     if code:
-        where = [one for one in args.overrides if one.startswith(("runs_dir=", "sweep.storage="))]
+        where = [word for word in args.overrides if word.startswith(("runs_dir=", "sweep.storage="))]
         line = shlex.join(["deepracer-exp", "sweep", f"study={study.study_name}", *where])
         print(f"\ninterrupted; resume it with: {line}", file=sys.stderr)
         return code
@@ -294,8 +295,8 @@ def _sweep(args: argparse.Namespace) -> int:
 
 def _show_study(word: str, *arguments: str) -> int:
     """Write the report of a study, or print its best trial."""
-    names = [given for given in arguments if not is_override(given)]
-    stores = read_stores((given for given in arguments if is_override(given)), ["sweep.storage"])
+    names = [argument for argument in arguments if not is_override(argument)]
+    stores = read_stores((argument for argument in arguments if argument not in names), ["sweep.storage"])
     if len(names) != 1:
         raise BadInput(f"sweep {word}: accepted: one study, as in `deepracer-exp sweep {word} lr_entropy`")
 
@@ -323,8 +324,7 @@ def _show_study(word: str, *arguments: str) -> int:
     return 0
 
 
-def _print_best(study: object) -> None:
+def _print_best(study: "Study") -> None:
     from deepracer_exp.sweeps.report.best import best_line, best_shown, best_trial
 
-    number, shown = best_trial(study).number, best_shown(study)  # type: ignore[arg-type]
-    print(f"\nbest: trial {number}, {shown}\n\n  {best_line(study)}")  # type: ignore[arg-type]
+    print(f"\nbest: trial {best_trial(study).number}, {best_shown(study)}\n\n  {best_line(study)}")

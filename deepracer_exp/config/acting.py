@@ -124,11 +124,9 @@ def remember() -> None:
 def leave_out_foreign(config: dict[str, Any], where: str) -> list[str]:
     """Leave out of a stored configuration what acts and is not the user's own; return a line for each such value.
 
-    Code stays as text: `refuse_reward` and `load_class` decide about it before it is run.
+    The configuration is changed in place; `where` says in the lines what stores it.
 
-    Args:
-        config: all values, changed in place.
-        where: what stores them, for the lines.
+    Code stays as text: `refuse_reward` and `load_class` decide about it before it is run.
     """
     left_out = []
     for value in list(acting(config)):
@@ -160,10 +158,7 @@ def _wandb_words(tracking: Mapping[str, Any]) -> str:
 def refuse_reward(file: str | None, where: str, copy: Path | None = None) -> None:
     """Refuse to run a file as reward function that only a stored configuration names.
 
-    Args:
-        file: None: there is no file.
-        where: what stores the configuration, for the message.
-        copy: of the file, to be named where that is not on this machine.
+    `where` says what stores the configuration. The message names `copy` if the file is not on this machine.
 
     Raises:
         BadInput: the message says how the user names it.

@@ -105,14 +105,16 @@ def compose_entry(entry: str, overrides: Sequence[str], *, stored: bool = False)
     overrides = without_passwords(list(overrides))
     if entry != "train":  # it reads a stored run, whose classes are its own
         overrides = allow_given(overrides)
-    given = [parse_single(override) for override in overrides]
-    own = [by_world_name(override) for override in given if override.key_or_group != custom_files.KEY]
-    for override in own:
+    parsed = [parse_single(override) for override in overrides]
+    rest = [by_world_name(override) for override in parsed if override.key_or_group != custom_files.KEY]
+    for override in rest:
         _check_key(entry, override)
-    files = _files(given, {one.key_or_group: text for one, text in zip(given, overrides, strict=True)})
-    own = [*map(parse_single, files.lines), *own]
-    chosen = [override for override in own if override.key_or_group in groups(entry)]
-    changing = [override for override in own if override.key_or_group not in groups(entry)]
+    files = _files(
+        parsed, {override.key_or_group: text for override, text in zip(parsed, overrides, strict=True)}
+    )
+    rest = [*map(parse_single, files.lines), *rest]
+    chosen = [override for override in rest if override.key_or_group in groups(entry)]
+    changing = [override for override in rest if override.key_or_group not in groups(entry)]
     names: tuple[str, ...] = ()
     if TRACK in groups(entry):
         names, changing = several_tracks(chosen, changing)
@@ -191,26 +193,23 @@ def compose_option(group: str, option: str, kind: type[Config]) -> Config:
 def check_option(group: str, name: object, key: str | None = None) -> None:
     """Refuse a name that is not an option of the group, so that a name never becomes a path.
 
-    Args:
-        group: of the options.
-        name: the given name.
-        key: the key it was given for, if that is not the group.
+    `key` is what it was given for, if that is not the group.
 
     Raises:
         BadInput: there is no such option.
     """
-    known, key = options(group), key or group
+    names, key = options(group), key or group
     if not isinstance(name, str):
-        raise Unknown(override_line(key, name), f"no such {group}; options: {listed(group, known)}")
-    if (own := own_option(group, name)) is not None:
-        ConfigStore.instance().store(group=group, name=name, node=own)
+        raise Unknown(override_line(key, name), f"no such {group}; options: {listed(group, names)}")
+    if (class_values := own_option(group, name)) is not None:
+        ConfigStore.instance().store(group=group, name=name, node=class_values)
         return
-    if name.removesuffix(".yaml") in known or (group == TRACK and find_world(name)):
+    if name.removesuffix(".yaml") in names or (group == TRACK and find_world(name)):
         return
-    hint = nearest(name, known)
+    hint = nearest(name, names)
     if key == group and f"{group}.file" in PLAIN_TEXT and Path(name).suffix in _FILES:
         hint = f" (did you mean {group}.file={name}?)"
-    raise Unknown(f"{key}={name}", f"no such {group}{hint}; options: {listed(group, known)}")
+    raise Unknown(f"{key}={name}", f"no such {group}{hint}; options: {listed(group, names)}")
 
 
 def check_choice(group: str, value: object) -> None:
@@ -258,13 +257,13 @@ def expand_grid(overrides: Sequence[str]) -> list[list[str]]:
         if math.prod(map(len, axes)) * count > MOST_RUNS:
             raise BadInput(f"{line}: more than {MOST_RUNS:,} runs; accepted with -m: up to {MOST_RUNS:,}")
         key = override.get_key_element()
-        axes.append([f"{key}={one}" for one in override.sweep_string_iterator()])
+        axes.append([f"{key}={text}" for text in override.sweep_string_iterator()])
     return [list(combination) for combination in itertools.product(*axes)]
 
 
-def _files(given: Sequence[Override], typed: Mapping[str, str]) -> FileOverrides:
+def _files(parsed: Sequence[Override], typed: Mapping[str, str]) -> FileOverrides:
     """Return the overrides of the last `custom_files`, if any; `typed` has every other override by its key."""
-    folders = [override.value() for override in given if override.key_or_group == custom_files.KEY]
+    folders = [override.value() for override in parsed if override.key_or_group == custom_files.KEY]
     if not folders or folders[-1] is None:
         return FileOverrides((), {}, ())
     return file_overrides(read_custom_files(str(folders[-1])), typed)

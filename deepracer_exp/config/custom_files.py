@@ -338,9 +338,7 @@ class FileOverrides:
 def file_overrides(files: CustomFiles, typed: Mapping[str, str]) -> FileOverrides:
     """Turn files into overrides.
 
-    Args:
-        files: the files found.
-        typed: the user's own overrides by key or group; they have priority.
+    `typed` has the user's own overrides by key or group; they have priority.
     """
     lines: list[str] = []
     names: dict[str, str] = {}
@@ -419,11 +417,7 @@ def car_override(files: CustomFiles, typed: Mapping[str, str]) -> tuple[list[str
 
 
 def _left(files: CustomFiles, typed: Mapping[str, str]) -> list[str]:
-    """Return a line for each file that is not used.
-
-    Raises:
-        BadInput: several files could be the one that is missing, and the user chose none.
-    """
+    """Return a line for each file that is not used."""
     notes = list(files.unused)
     for name, (wanted, others) in files.left.items():
         group, key = _CHOSEN_BY[name]

@@ -60,7 +60,7 @@ class Range:
             raise BadInput(
                 f"from {self.low} to {self.high}", f"more than {_MOST_VALUES:,} values to try one by one"
             )
-        return [_at(self.low, self.step, index) for index in range(last + 1)]
+        return [_value_at(self.low, self.step, index) for index in range(last + 1)]
 
 
 def dimension(key: str, expression: str) -> Choices | Range:
@@ -166,9 +166,7 @@ def _interval(line: str, low: Number, high: Number, log: bool) -> Range:
 def range_length(sweep: RangeSweep, line: str) -> int:
     """Return the number of values of a `range()`.
 
-    Args:
-        sweep: the range.
-        line: the override, for messages.
+    `line` is the override, for messages.
 
     Raises:
         BadInput: it has none, or an end is not finite.
@@ -188,7 +186,7 @@ def _range(line: str, sweep: RangeSweep, log: bool) -> Range:
     count = range_length(sweep, line)
     start, step = sweep.start, sweep.step
     assert start is not None
-    first, last = _at(start, step, 0), _at(start, step, count - 1)
+    first, last = _value_at(start, step, 0), _value_at(start, step, count - 1)
     low, high = min(first, last), max(first, last)
     _check_log(line, low, log)
     if log and (isinstance(low, float) or abs(step) != 1):
@@ -196,7 +194,7 @@ def _range(line: str, sweep: RangeSweep, log: bool) -> Range:
     return Range(low, high, abs(step), log)
 
 
-def _at(start: Number, step: Number, steps: int) -> Number:
+def _value_at(start: Number, step: Number, steps: int) -> Number:
     """Return `start` plus so many steps, computed in decimals: three steps of 0.1 from 0 are 0.3."""
     if isinstance(start, int) and isinstance(step, int):
         return start + steps * step

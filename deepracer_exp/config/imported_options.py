@@ -32,7 +32,7 @@ def import_files(
     mapping: Mapping[str, Any],
     more: Sequence[str] = (),
     source: str | None = None,
-    own: Mapping[str, str] | None = None,
+    typed: Mapping[str, str] | None = None,
 ) -> list[Path]:
     """Write `./conf/GROUP/NAME.yaml` for each file and `./conf/experiment/NAME.yaml` for all of them.
 
@@ -44,7 +44,7 @@ def import_files(
         mapping: the experiment that the files describe, validated.
         more: overrides that belong to the experiment, too.
         source: where the files come from, if their folder is a temporary one.
-        own: the user's own overrides by key or group, in whose place none is written.
+        typed: the user's own overrides by key or group, in whose place none is written.
 
     Returns:
         The files written, the experiment's last.
@@ -71,7 +71,7 @@ def import_files(
     }
     if files.is_sac and "algorithm" not in imported.values():
         experiment["defaults"].append({"override /algorithm": SAC_OPTION})
-    job, _ = job_overrides(files.workers, own or {})
+    job, _ = job_overrides(files.workers, typed or {})
     lines = [*([override_line("car", files.car)] if files.car else ()), *job, *more]
     left_out = several_of(job)
     for override in map(parse_single, (line for line in lines if line not in left_out)):
@@ -107,10 +107,7 @@ def check_action_space_name(name: str) -> None:
 def write_action_space(name: str, actions: Iterable[Action], comment: str) -> Path:
     """Write a list of actions as `./conf/action_space/NAME.yaml`.
 
-    Args:
-        name: name of the new option.
-        actions: in their order.
-        comment: one line that says where they come from.
+    `comment` is a line that says where they come from.
 
     Raises:
         BadInput: as for `check_action_space_name`, or the file cannot be written.

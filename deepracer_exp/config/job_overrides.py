@@ -25,9 +25,8 @@ _NOT_APPLICABLE = {
 def job_overrides(workers: Sequence[JobSettings], typed: Mapping[str, str]) -> tuple[list[str], list[str]]:
     """Turn the settings of a training into overrides.
 
-    Args:
-        workers: one for each simulation worker; each may have another track. Starts are those of the first.
-        typed: the user's own overrides by key or group; they have priority.
+    Each simulation worker may have another track; starts are those of the first. `typed` has the user's own overrides
+    by key or group, which have priority.
 
     Returns:
         The overrides, and a line for each key used, not used or not used as it is there, with the reason.

@@ -103,9 +103,7 @@ def named_again(config: Mapping[str, Any], groups: Sequence[str] = GROUPS) -> li
 def load_class(target: str, key: str) -> type:
     """Import a class.
 
-    Args:
-        target: `package.module:Class`.
-        key: the configuration's key, for messages.
+    `target` is `package.module:Class`, `key` the configuration's key for messages.
 
     Raises:
         BadInput: only a stored run or study names it, or it cannot be imported.
@@ -130,11 +128,7 @@ def load_class(target: str, key: str) -> type:
 def build_own(chosen: OwnClass, key: str, base: type[Base], *arguments: Any) -> Base:
     """Build an object of a class of the user's own.
 
-    Args:
-        chosen: the class and its keyword arguments.
-        key: of `own.target`, for messages.
-        base: that it must derive from.
-        arguments: positional arguments, before the keyword arguments.
+    It must derive from `base`; `arguments` precede its keyword arguments, and `key` is for messages.
 
     Raises:
         BadInput: it cannot be imported, has another base or signature, or its constructor fails.

@@ -52,11 +52,7 @@ def _adapter(kind: type[Config]) -> TypeAdapter[Config]:
 
 
 def _check_combinations(experiment: Experiment) -> None:
-    """Refuse values that are accepted one by one but contradict one another.
-
-    Raises:
-        BadInput: the message names the keys, their values and what is accepted there.
-    """
+    """Refuse values that are accepted one by one but contradict one another."""
     algorithm, collector = experiment.algorithm, experiment.collector
     if (algorithm.frames_per_iteration is None) == (algorithm.episodes_per_iteration is None):
         raise BadInput(
@@ -174,10 +170,7 @@ def _first_finding(mapping: dict[str, Any], error: ValidationError) -> BadInput:
 def _key_of(mapping: dict[str, Any], path: list[str], ends_in_key: bool) -> str:
     """Return the dotted key of a finding; pydantic also puts the tags of unions into its path.
 
-    Args:
-        mapping: the values.
-        path: of the finding.
-        ends_in_key: whether its last part is a key, even if the values do not have it.
+    `ends_in_key` says whether the last part of the path is a key even if the values do not have it.
     """
     key: list[str] = []
     node: Any = mapping

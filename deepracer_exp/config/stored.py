@@ -80,12 +80,7 @@ def with_overrides(
 
 
 def config_differences(configs: Sequence[Mapping[str, Any]], prefix: str = "") -> dict[str, list[Any]]:
-    """Return the values that differ between configurations, by dotted key; ABSENT for a missing key.
-
-    Args:
-        configs: the values of each configuration.
-        prefix: prefix of the keys.
-    """
+    """Return the values that differ between configurations, by dotted key; ABSENT for a missing key."""
     differences: dict[str, list[Any]] = {}
     for key in dict.fromkeys(key for config in configs for key in config):
         values = [config.get(key, ABSENT) for config in configs]

@@ -153,8 +153,8 @@ class SweepRequest:
         Raises:
             BadInput: it is not a path.
         """
-        given = [line for line in self.base if key_of(line) == "runs_dir"]
-        return Path(compose_experiment(given[-1:], stored=self.stored)[0].runs_dir)
+        lines = [line for line in self.base if key_of(line) == "runs_dir"]
+        return Path(compose_experiment(lines[-1:], stored=self.stored)[0].runs_dir)
 
 
 def compose_sweep(overrides: Sequence[str], *, stored: bool = False) -> SweepRequest:
@@ -172,10 +172,10 @@ def compose_sweep(overrides: Sequence[str], *, stored: bool = False) -> SweepReq
         BadInput: an override cannot be parsed, or one for the sweep has an unknown key or a value that is not accepted.
             Keys of the training are not checked.
     """
-    own = [override for override in overrides if _is_of_the_sweep(override)]
-    for override in own:
+    of_the_sweep = [override for override in overrides if _is_of_the_sweep(override)]
+    for override in of_the_sweep:
         _check_own(override)
-    composition = compose_entry(_ENTRY, own, stored=stored)
+    composition = compose_entry(_ENTRY, of_the_sweep, stored=stored)
     entry = parse_config(composition.mapping, SweepEntry)
     check_option("evaluation", entry.sweep.protocol, "sweep.protocol")
     train = _TrainOverrides()
@@ -186,7 +186,7 @@ def compose_sweep(overrides: Sequence[str], *, stored: bool = False) -> SweepReq
     for key, expression in entry.sweep.space.items():
         dimension(key, expression)
         train.add(f"{key}={expression}")
-    typed_keys = [train.add(override) for override in overrides if override not in own]
+    typed_keys = [train.add(override) for override in overrides if override not in of_the_sweep]
     chosen = set(typed_keys) & set(groups())
     ready = set(entry.sweep.space) - set(typed_keys)
     optional = frozenset(key for key in ready if key.partition(".")[0] in chosen)
@@ -211,9 +211,9 @@ class _TrainOverrides:
         if parsed.is_sweep_override():
             _check_searched(key, override)
             self.space[key] = plain_expression(parsed, override.partition("=")[2])
-            found = dimension(key, self.space[key])
-            if key in groups() and isinstance(found, Choices):
-                for value in found.values:
+            searched_values = dimension(key, self.space[key])
+            if key in groups() and isinstance(searched_values, Choices):
+                for value in searched_values.values:
                     check_choice(key, override_value(as_override(key, value)))
         elif not (parsed.is_delete() and searched):
             self.base[key] = override

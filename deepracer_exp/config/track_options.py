@@ -79,10 +79,10 @@ def by_world_name(override: Override) -> Override:
         return override
     names = options(GROUP)
 
-    def own(name: object) -> object:
+    def world_name(name: object) -> object:
         return name if name in (ALL, *names) or "/" in str(name) else find_world(str(name)) or name
 
-    named = [own(name) for name in value] if isinstance(value, list) else own(value)
+    named = [world_name(name) for name in value] if isinstance(value, list) else world_name(value)
     return override if named == value else parse_single(override_line(GROUP, named))
 
 
@@ -91,9 +91,7 @@ def several_tracks(
 ) -> tuple[tuple[str, ...], list[Override]]:
     """Return the several tracks that overrides choose, and the overrides of values with a track's name in their keys.
 
-    Args:
-        choosing: overrides of groups.
-        changing: overrides of values.
+    `choosing` are overrides of groups, `changing` those of values.
 
     Returns:
         Names; none if one track or none is chosen. Overrides of all tracks before those of single ones, which have

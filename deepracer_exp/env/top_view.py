@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from deepracer_exp.tracks.picture import draw_track, extent
+from deepracer_exp.tracks.outline import draw_track, extent
 from deepracer_exp.tracks.track import Track
 
 from .race import Race

@@ -12,7 +12,7 @@ from rich.console import Console
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.sim import mujoco
 from deepracer_exp.sim.car import STEERED, WHEELS, build_spec
-from deepracer_exp.tracks.picture import draw_track, extent
+from deepracer_exp.tracks.outline import draw_track, extent
 from deepracer_exp.tracks.track import Track
 
 from .film import FRAMES_PER_S, Lap, in_frames, png, write_film

@@ -163,11 +163,7 @@ class Question:
         return lap_time_s(math.ceil(least_s * car.control_hz - 1e-9), car), line
 
     def _drive(self, commands: Floats) -> Floats:
-        """Drive commands [speed_mps, steering_rad], (n, 2), in the environment and return its steps.
-
-        Raises:
-            RunFailed: they are no lap there.
-        """
+        """Drive commands [speed_mps, steering_rad], (n, 2), in the environment and return its steps."""
         experiment, track = self.experiment, self.track
         plain = replace(
             experiment,
@@ -230,11 +226,7 @@ def kept_lap(question: Question) -> FastestLap | None:
 
 
 def _table(rows: Any) -> Floats:
-    """Return the steps of a file.
-
-    Raises:
-        ValueError: they are none.
-    """
+    """Return the steps of a file."""
     steps = np.array(rows, np.float64)
     if steps.ndim != 2 or steps.shape[1] != len(COLUMNS) or not len(steps) or not np.isfinite(steps).all():
         raise ValueError("not the steps of a lap")

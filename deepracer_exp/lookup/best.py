@@ -44,14 +44,14 @@ def best_of(experiment: str, runs_dir: Path) -> Path:
         return of_sweep
     runs = sorted(file.parent for file in folder.glob(f"*/{CONFIG}"))
     if not runs:
-        known = sorted({run.parent.name for run in run_folders(runs_dir)})
+        experiments = sorted({run.parent.name for run in run_folders(runs_dir)})
         raise BadInput(
             what,
-            f"no such experiment in {runs_dir}{nearest(experiment, known)}; experiments there: "
-            f"{', '.join(known[:10]) or 'none'}",
+            f"no such experiment in {runs_dir}{nearest(experiment, experiments)}; experiments there: "
+            f"{', '.join(experiments[:10]) or 'none'}",
         )
     results = {run: result for run in runs if (result := _result(run)) is not None}
-    results = {run: one for run, one in results.items() if one.evaluated} or results
+    results = {run: result for run, result in results.items() if result.evaluated} or results
     if not results:
         if len(runs) == 1 and (runs[0] / CHECKPOINTS / "best").is_dir():
             return runs[0]
@@ -120,14 +120,14 @@ def _check_comparable(what: str, results: Mapping[Path, RunResult]) -> None:
     terms = {run: _terms(read_config(run), result) for run, result in results.items()}
     for run in others:
         for key, value in terms[first].items():
-            one, other = value, terms[run][key]
-            if one == other:
+            mine, other = value, terms[run][key]
+            if mine == other:
                 continue
-            if _short(one) == _short(other):  # of one name
-                key, (one, other) = next(iter(config_differences([{key: one}, {key: other}]).items()))
+            if _short(mine) == _short(other):  # of one name
+                key, (mine, other) = next(iter(config_differences([{key: mine}, {key: other}]).items()))
             raise BadInput(
                 what,
-                f"its runs cannot be ranked: {key} is {_short(one)} in {first.name} and {_short(other)} in "
+                f"its runs cannot be ranked: {key} is {_short(mine)} in {first.name} and {_short(other)} in "
                 f"{run.name}; name one of them, and train what differs under another name=",
             )
 

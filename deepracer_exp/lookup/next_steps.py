@@ -41,29 +41,31 @@ def outcome(run: RunRecord) -> list[tuple[str, str]]:
         BadInput: its summary.json is not what a training writes.
     """
     tracks, reward = run.config.get("track") or {}, run.config.get("reward") or {}
-    courses = [
-        one for one in ([tracks] if "title" in tracks else tracks.values()) if isinstance(one, Mapping)
+    listed = [tracks] if "title" in tracks else tracks.values()
+    names = [
+        f"{track.get('title')}, {track.get('direction', 'forward')}"
+        for track in listed
+        if isinstance(track, Mapping)
     ]
-    names = [f"{one.get('title')}, {one.get('direction', 'forward')}" for one in courses]
-    found = [
+    facts = [
         ("Track", "; ".join(name.removesuffix(", forward") for name in names)),
         ("Reward", str(reward.get("name") or reward.get("file"))),
     ]
     result = read_result(run.path)
     if result is not None and result.evaluated:
-        known = [(result.figure(name), getattr(result, key), form) for name, key, form, _ in FIGURES]
-        found += [
+        figures = [(result.figure(name), getattr(result, key), form) for name, key, form, _ in FIGURES]
+        facts += [
             (f"{name[0].upper()}{name[1:]}", form.format(value))
-            for name, value, form in known
+            for name, value, form in figures
             if value is not None
         ]
-        found.append(("Best checkpoint", f"{result.iteration:06d}, by {result.criterion}"))
+        facts.append(("Best checkpoint", f"{result.iteration:06d}, by {result.criterion}"))
         with contextlib.suppress(BadInput):  # a page is written of a run whose metrics are damaged, too
             if (lap := fastest_reliable(run.rows or read_metrics(run.path / METRICS))) is not None:
-                found.append(("Fastest reliable lap", str(lap)))
+                facts.append(("Fastest reliable lap", str(lap)))
     elif run.summary:
-        found.append(("Evaluated", "never"))
-    return [*found, ("State", state(run))]
+        facts.append(("Evaluated", "never"))
+    return [*facts, ("State", state(run))]
 
 
 def official_place(run: RunRecord) -> str | None:
@@ -105,8 +107,8 @@ def state(run: RunRecord) -> str:
 
 def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return commands for a run folder with its summary.json, each with what it does, the first to be used first."""
-    word, own, config = run_word(run), own_word(run), read_config(run)
-    resume = command_line("resume", own, config)
+    word, name, config = run_word(run), own_word(run), read_config(run)
+    resume = command_line("resume", name, config)
     steps = []
     if summary["iteration"]:
         evaluate = command_line("evaluate", word, config, OF_POLICY)
@@ -127,7 +129,7 @@ def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         "minutes": summary["wall_clock_s"] / 60,
     }
     if limit is None:
-        resume = command_line("resume", own, config, [group for group in GROUPS if group != "stopping"])
+        resume = command_line("resume", name, config, [group for group in GROUPS if group != "stopping"])
         steps.append((f"{resume} stopping=none", "continue it until its budget is used"))
     elif limit in spent:  # else the rest of an experiment's budget decides
         budget = {key: most for key, most in config["budget"].items() if key in spent and most is not None}

@@ -151,30 +151,26 @@ def resolve(run: str, runs_dir: Path, tracking_uri: str | None) -> StoredRun:
     return _of_registered(run, registered, runs_dir, tracking_uri)
 
 
-def _of_registered(run: str, found: Registered, runs_dir: Path, tracking_uri: str | None) -> StoredRun:
+def _of_registered(run: str, registered: Registered, runs_dir: Path, tracking_uri: str | None) -> StoredRun:
     """Return the run of a registered checkpoint, which must be as it was; it is downloaded where it is not."""
-    places = found.run_dir, download_folder(found.run_dir, runs_dir)
-    path = next((one for one in places if (one / CHECKPOINTS / found.checkpoint).is_dir()), None)
+    places = registered.run_dir, download_folder(registered.run_dir, runs_dir)
+    path = next((place for place in places if (place / CHECKPOINTS / registered.checkpoint).is_dir()), None)
     if path is None:
-        path = fetch(found, tracking_uri, runs_dir)
-        logger.warning("%s was downloaded from MLflow to %s", found, path)
-    checkpoint = path / CHECKPOINTS / found.checkpoint
+        path = fetch(registered, tracking_uri, runs_dir)
+        logger.warning("%s was downloaded from MLflow to %s", registered, path)
+    checkpoint = path / CHECKPOINTS / registered.checkpoint
     verify(checkpoint)
-    if checkpoint_sha256(checkpoint) != found.sha256:
+    if checkpoint_sha256(checkpoint) != registered.sha256:
         raise BadInput(
             run,
-            f"{checkpoint} is not the checkpoint that was registered as {found}, version {found.version}: its hash "
-            "differs; give the run and checkpoint= to use it anyway",
+            f"{checkpoint} is not the checkpoint that was registered as {registered}, version {registered.version}: "
+            "its hash differs; give the run and checkpoint= to use it anyway",
         )
-    return StoredRun(path, found.checkpoint, registered=str(found))
+    return StoredRun(path, registered.checkpoint, registered=str(registered))
 
 
 def _recorded(run: str, runs_dir: Path, tracking_uri: str | None) -> Path:
-    """Return the folder of the run with an id, where it was recorded or where all runs have moved to.
-
-    Raises:
-        BadInput: the store has no such run, it was deleted there, the store does not answer, or the folder is gone.
-    """
+    """Return the folder of the run with an id, where it was recorded or where all runs have moved to."""
     with open_client(run, tracking_uri, runs_dir) as client:
         recorded = client.get_run(run)
     if recorded.info.lifecycle_stage != "active":

@@ -10,13 +10,11 @@ import pandas as pd
 
 from deepracer_exp.analysis.charts import (
     actions,
-    against_fastest,
     driving_line,
     laps,
     mistakes,
     rewards,
     training,
-    zigzag,
 )
 from deepracer_exp.analysis.charts.figure import Chart
 from deepracer_exp.analysis.charts.runs import generalisation_matrix, generations, policy_of, run_folder
@@ -52,12 +50,12 @@ SECTIONS: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
     _BESIDE: (),
     "Lap times": (
         *(laps.lap_time_percentile, laps.lap_time_histogram, laps.lap_delta),
-        against_fastest.against_fastest,
+        driving_line.against_fastest,
         *(laps.correlations, laps.start_position),
     ),
     "The line it drives": (
         *(driving_line.lap_line, driving_line.sector_times, driving_line.speed_steering_by_waypoint),
-        zigzag.zigzag,
+        driving_line.zigzag,
         *(driving_line.racing_line, driving_line.acceleration_map, driving_line.slide_map),
     ),
     "Where it goes wrong": (mistakes.off_track_risk, mistakes.episode_ends_map, mistakes.visits_map),

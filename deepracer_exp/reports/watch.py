@@ -27,7 +27,7 @@ from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.files import FILMS
 from deepracer_exp.sim.lidar import ANGLES_RAD, MOUNT_X_M
 from deepracer_exp.sim.scenery import box_corners
-from deepracer_exp.tracks.picture import draw_track, extent
+from deepracer_exp.tracks.outline import draw_track, extent
 
 from .sight import degrees, picture_of, saliency, under_heat
 

@@ -180,12 +180,8 @@ class CheckpointStore:
     ) -> None:
         """Save the agent under the number of its iteration.
 
-        Args:
-            agent: networks, optimizer and schedule, and where it has one a replay, which is written beside it.
-            counters: iteration, env steps and the like, JSON types.
-            training: the rest of what a resumed training needs: tensors, arrays and JSON types; None: no training
-                can resume from here, and the checkpoint is not `last`.
-            best: it is the best so far.
+        `training` is the rest of what a resumed training needs: tensors, arrays and JSON types; None: no training can
+        resume from here, and the checkpoint is not `last`. `best`: it is the best so far.
 
         Raises:
             OSError, RunFailed: the folder cannot be written; what was there before is unchanged.

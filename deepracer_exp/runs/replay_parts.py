@@ -97,11 +97,7 @@ class ReplayParts:
 
 
 def _read(path: Path) -> TensorDictBase:
-    """Return the rows of a part.
-
-    Raises:
-        BadInput: it is corrupt.
-    """
+    """Return the rows of a part."""
     check_folder(path, {_STEPS}, {_STEPS})
     state = State({})
     load_component(path, _STEPS, state, _PROBLEM)

@@ -152,8 +152,7 @@ class ReliableLap:
 def fastest_reliable(rows: Iterable[Mapping[str, Any]]) -> ReliableLap | None:
     """Return the fastest lap among evaluated policies that completed `RELIABLE` of their usual laps, None without.
 
-    Args:
-        rows: of metrics.jsonl.
+    The rows are those of metrics.jsonl.
     """
     reliable = [row for row in rows if reliable_lap_s(row) is not None]
     if not reliable:

@@ -97,10 +97,7 @@ def entropy_share(entropy: float, at_start: float, action_count: int | None) -> 
 def entropy_over_target(entropy: float, target: float, action_count: int | None) -> float:
     """Return the entropy of a policy that is led to a target, as SAC's is by its temperature, as a share of it.
 
-    Args:
-        entropy: in nats.
-        target: in nats.
-        action_count: as of `entropy_share`.
+    Both are in nats.
 
     Returns:
         1 at the target; of a continuous policy the ratio of the spreads, as in `entropy_share`.

@@ -51,9 +51,6 @@ def _check_shared(request: SweepRequest) -> tuple[str, ...]:
     """Check the files and options that all trials share and return the remarks on their actions.
 
     The values of the search are checked with the search space, which needs Optuna.
-
-    Raises:
-        BadInput: there is no such file or option.
     """
     shared = (*groups(), custom_files.KEY, "teacher", "runs_dir")
     named = [line for line in request.base if (key := key_of(line)) in shared or key.endswith(".file")]

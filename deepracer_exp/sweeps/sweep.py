@@ -17,6 +17,7 @@ from optuna.study import Study
 from optuna.trial import FrozenTrial
 from rich.console import Console
 
+from deepracer_exp.analysis.statistics import Values
 from deepracer_exp.config import acting
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.experiment import Experiment
@@ -38,12 +39,11 @@ from .plan import SweepPlan
 from .queue.claims import Claim, TrialClaims, report_results
 from .queue.driver import Driver
 from .queue.launcher import LocalLauncher
-from .queue.parent import Parent, plan_trial
 from .queue.ray_launcher import RayLauncher
 from .queue.storage import open_storage, patiently, resolve_database
 from .queue.study import open_study
 from .queue.worker import Interrupted
-from .queue.worker_config import WorkerConfig
+from .queue.worker_config import Parent, WorkerConfig, plan_trial
 from .report.best import (
     FreshLaps,
     best_line,
@@ -163,9 +163,9 @@ def _run(
     """Run the workers, then derive everything else from the trial claims; return the exit code."""
     claims, patience_s = TrialClaims(storage.engine, worker_config.study), worker_config.config.patience_s
 
-    def track(found: Sequence[Claim]) -> None:
+    def track(now: Sequence[Claim]) -> None:
         if study_run is not None:
-            study_run.update(_progress(found, worker_config.config, study))
+            study_run.update(_progress(now, worker_config.config, study))
 
     with Interruption() as interruption, SweepView(worker_config, launcher.workers, console) as view:
         view.show(patiently(claims.all, patience_s))
@@ -189,7 +189,7 @@ def _progress(claims: Sequence[Claim], config: SweepConfig, study: Study) -> Pro
     """Return the progress of the study, for MLflow."""
     ended = [claim.trial for claim in claims if claim.has_ended]
     counts = collections.Counter(trial.state for trial in ended)
-    known: dict[str, Any] = {
+    counted: dict[str, Any] = {
         "total": config.trials,
         "complete": counts["COMPLETE"],
         "pruned": counts["PRUNED"],
@@ -197,10 +197,10 @@ def _progress(claims: Sequence[Claim], config: SweepConfig, study: Study) -> Pro
         "env_steps": sum(trial.env_steps for trial in ended),
     }
     if not complete_trials(study):
-        return Progress(**known)
+        return Progress(**counted)
     best = best_trial(study)
     return Progress(
-        **known,
+        **counted,
         best_trial=best.number,
         best_values=dict(zip(config.objectives, best_values(study), strict=True)),
         best_shown=best_shown(study),
@@ -217,11 +217,7 @@ def _conclude(
     claims: TrialClaims,
     interruption: Interruption,
 ) -> None:
-    """Find the winner, and write best_of_sweep.json and the page.
-
-    Raises:
-        Interrupted: the process was asked to end during the fresh laps.
-    """
+    """Find the winner, and write best_of_sweep.json and the page."""
     # Imported here: it takes seconds, and the workers start first.
     from .report.page import write_study_page
 
@@ -257,20 +253,20 @@ def _without_rules(request: SweepRequest, overrides: Sequence[str]) -> SweepRequ
     if "entropy" in request.entry.sweep.pruners:
         return request
     chosen = any(key_of(line) == "sweep.pruners" for line in overrides)
-    given = overrides if chosen else (*request.base, *request.space)
-    if "stopping" in map(group_of, given):
+    lines = overrides if chosen else (*request.base, *request.space)
+    if "stopping" in map(group_of, lines):
         return request
     base = [line for line in request.base if group_of(line) != "stopping"]
     return replace(request, base=(*base, "stopping=none"))
 
 
-def _parent(request: SweepRequest, known: Study | None) -> Parent | None:
+def _parent(request: SweepRequest, study: Study | None) -> Parent | None:
     """Return the run that trials clone: the stored one of a study that has begun."""
     run = request.entry.parent
     if run is None:
         return None
-    if known is not None and known.user_attrs.get("parent") == run and "parent_run" in known.user_attrs:
-        return Parent(**known.user_attrs["parent_run"])
+    if study is not None and study.user_attrs.get("parent") == run and "parent_run" in study.user_attrs:
+        return Parent(**study.user_attrs["parent_run"])
     return Parent.find(run, request.study, request.runs_dir)
 
 
@@ -305,13 +301,13 @@ def rerank(
     """
     config = worker_config.config
     protocol = fresh(worker_config.protocol, config.rerank_laps)
-    found = []
+    fresh_laps = []
     for trial in complete_trials(study)[: config.rerank]:
         on_next(trial)
         runs = Trial.of(trial).runs
         driven = [_driven(run.folder(worker_config.folder), protocol, on_step) for run in runs]
-        found.append(_reranked(trial.number, driven, config.objectives, protocol.time_s))
-    return sorted(found, key=lambda laps: cost(config.objectives, laps.values))
+        fresh_laps.append(_reranked(trial.number, driven, config.objectives, protocol.time_s))
+    return sorted(fresh_laps, key=lambda laps: cost(config.objectives, laps.values))
 
 
 def interval_of(evaluations: Sequence[Evaluation], objective: str, trial_time_s: float) -> list[float]:
@@ -324,11 +320,11 @@ def interval_of(evaluations: Sequence[Evaluation], objective: str, trial_time_s:
     counted = [
         [
             group
-            for group in one.groups
+            for group in evaluation.groups
             if group.track == track and (objective == "race_score" or group.condition == USUAL)
         ]
-        for one in evaluations
-        for track in one.tracks
+        for evaluation in evaluations
+        for track in evaluation.tracks
     ]
     draws = np.mean([_draws(groups, objective, trial_time_s, rng) for groups in counted], axis=0)
     tail = 100 * (1 - _CONFIDENCE) / 2
@@ -337,7 +333,7 @@ def interval_of(evaluations: Sequence[Evaluation], objective: str, trial_time_s:
 
 def _draws(
     groups: Sequence[TrialGroup], objective: str, trial_time_s: float, rng: np.random.Generator
-) -> "np.ndarray[Any, np.dtype[np.float64]]":
+) -> Values:
     """Return the objective's value on one track in each resample, (n,)."""
     if objective == "zigzag":
         return _zigzag_draws(groups, rng)
@@ -345,25 +341,21 @@ def _draws(
     completion = progress / tried
     if objective == "completion":
         return completion
-    fallback = np.array([without_lap(one, trial_time_s) for one in completion])
+    fallback = np.array([without_lap(share, trial_time_s) for share in completion])
     return np.where(laps > 0, time_s / np.maximum(laps, 1), fallback)
 
 
-def _zigzag_draws(
-    groups: Sequence[TrialGroup], rng: np.random.Generator
-) -> "np.ndarray[Any, np.dtype[np.float64]]":
+def _zigzag_draws(groups: Sequence[TrialGroup], rng: np.random.Generator) -> Values:
     """Return changes of steering a metre in each resample of the trials, (n,)."""
-    zigzags = [one for group in groups for one in group.zigzags]
-    sums = np.array([(one.changes, one.straight_m) for one in zigzags]).T
+    zigzags = [zigzag for group in groups for zigzag in group.zigzags]
+    sums = np.array([(zigzag.changes, zigzag.straight_m) for zigzag in zigzags]).T
     changes, straight_m = sums[:, rng.integers(len(zigzags), size=(_RESAMPLES, len(zigzags)))].sum(axis=2)
     return changes / np.maximum(straight_m, 1.0)
 
 
-def _resampled(
-    group: TrialGroup, objective: str, rng: np.random.Generator
-) -> "np.ndarray[Any, np.dtype[np.float64]]":
+def _resampled(group: TrialGroup, objective: str, rng: np.random.Generator) -> Values:
     """Return laps tried, complete laps, counted time and progress in each resample of the trials, (4, n)."""
-    column = {trial: at for at, trial in enumerate(group.trials)}
+    column = {trial: place for place, trial in enumerate(group.trials)}
     sums = np.zeros((4, len(column)))
     for attempt in group.decided:
         time_s = attempt.time_s if objective == "race_score" or attempt.complete else 0.0
@@ -379,13 +371,15 @@ def _driven(run_dir: Path, protocol: EvaluationConfig, on_step: OnStep) -> Evalu
 def _reranked(
     number: int, driven: Sequence[Evaluation], objectives: Sequence[str], trial_time_s: float
 ) -> FreshLaps:
-    times = [time for one in driven if (time := one.on(USUAL).mean_lap_time_s) is not None]
-    held_out = [one.on(HELD_OUT).completion for one in driven if HELD_OUT in one.conditions]
+    usual = [evaluation.on(USUAL) for evaluation in driven]
+    times_s = [laps.mean_lap_time_s for laps in usual if laps.mean_lap_time_s is not None]
+    held_out = [race.on(HELD_OUT).completion for race in driven if HELD_OUT in race.conditions]
+    values = [objective_values(evaluation, objectives, trial_time_s) for evaluation in driven]
     return FreshLaps(
         trial=number,
-        values=np.mean([objective_values(one, objectives, trial_time_s) for one in driven], axis=0).tolist(),
+        values=np.mean(values, axis=0).tolist(),
         interval=interval_of(driven, objectives[0], trial_time_s),
-        lap_time_s=float(np.mean(times)) if times else None,
-        completion=float(np.mean([one.on(USUAL).completion for one in driven])),
+        lap_time_s=float(np.mean(times_s)) if times_s else None,
+        completion=float(np.mean([laps.completion for laps in usual])),
         held_out_completion=float(np.mean(held_out)) if held_out else None,
     )

@@ -130,19 +130,12 @@ def promote(
 ) -> Registered:
     """Register a checkpoint as a version of a model and give it the alias.
 
+    `name` is `best`, `last` or the number of an iteration; `features` and `seen` describe what the policy sees. The
+    alias is taken from the version that has it.
+
     The version is a logged model of MLflow: the checkpoint's files, the run's report and picture, a signature, and the
     checkpoint's evaluation as metrics. The checkpoint is pinned in the run's folder. A checkpoint that already is a
     version is not registered again.
-
-    Args:
-        run: its folder.
-        name: of the checkpoint: `best`, `last` or the number of an iteration.
-        model: name, created if it does not exist.
-        alias: moved from the version that has it.
-        features: names of the observed features.
-        seen: keys and shapes of what the policy sees.
-        uri: the store, as of `open_client`.
-        runs_dir: likewise.
 
     Raises:
         BadInput: a name is invalid, the checkpoint is missing or corrupt, the run is not recorded in this store or was

@@ -35,11 +35,9 @@ class StoreThread:
     def __init__(self, update: Callable[[], Mapping[str, str]], shown: str, meanwhile: str) -> None:
         """Start the thread.
 
-        Args:
-            update: brings the store up to date and returns what the store refused, with the reasons; it raises
-                StoreUnavailableError.
-            shown: address of the store, without password.
-            meanwhile: says what continues while the store does not answer.
+        `update` brings the store up to date and returns what the store refused, with the reasons; it raises
+        StoreUnavailableError. `shown` is the address of the store, without password, and `meanwhile` says what
+        continues while the store does not answer.
         """
         self.outage: str | None = None
         self.refusal: str | None = None

@@ -28,10 +28,6 @@ class Tracker:
     def open(self, folder: Path, run: TrackedRun) -> None:
         """Begin to record a new or resumed run; this is called first, once.
 
-        Args:
-            folder: that of the run.
-            run: its name, experiment, parameters and tags.
-
         Raises:
             BadInput: the run cannot be recorded.
         """

@@ -36,11 +36,6 @@ CENTER_COLOR = "#f5a623"
 def draw_terminal(track: Track, columns: int, rows: int) -> str:
     """Draw the course in braille: borders, start line and an arrow in driving direction.
 
-    Args:
-        track: The course.
-        columns: Most characters in a line.
-        rows: Most lines.
-
     Returns:
         Lines without trailing blanks, joined by newlines.
     """
@@ -77,13 +72,10 @@ def draw_terminal(track: Track, columns: int, rows: int) -> str:
 def draw_picture(track: Track, path: str | Path, driven: np.ndarray | None = None) -> None:
     """Write a picture of the course; the file's ending chooses the format (.png, .svg, .pdf).
 
+    `driven` is a lap to draw on it, x and y in m and speed in m/s, (n, 3), coloured by its speed.
+
     It shows the road in its floor's colours, borders, centre line, start line, driving direction and
     every tenth waypoint with its index.
-
-    Args:
-        track: The course.
-        path: To write.
-        driven: A lap to draw on it, x and y in m and speed in m/s, (n, 3), coloured by its speed; None: none.
     """
     outline = Outline.of(track)
     low, high = outline.corners()

@@ -57,10 +57,7 @@ class Lanes:
     def poses(self, points: Floats, lane: NDArray[np.int64], track_index: TrackIndex) -> Pose:
         """Return the poses on the lanes that are nearest to points, facing along the lane's segment; (n,) each.
 
-        Args:
-            points: (n, 2), metres.
-            lane: `INNER` or `OUTER`, (n,).
-            track_index: index of each point's course, (n,).
+        `lane` is `INNER` or `OUTER` and `track_index` the course of each point, (n,); points are in metres, (n, 2).
         """
         x, y, yaw_rad = np.empty(len(points)), np.empty(len(points)), np.empty(len(points))
         for number, line in enumerate(self._lines):

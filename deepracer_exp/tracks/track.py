@@ -248,9 +248,7 @@ class Track:
 def world_track(name: str, reversed: bool = False) -> Track:
     """Return a world's course on a plain floor.
 
-    Args:
-        name: its name in the service in any case of letters, or its official name.
-        reversed: Drive against the order of its waypoints.
+    The name is its own in any case of letters, or its official one.
 
     Raises:
         BadInput: there is no such world.
@@ -344,11 +342,7 @@ def _frozen(array: np.ndarray) -> np.ndarray:
 
 
 def _check_crossings(center: np.ndarray) -> None:
-    """Refuse a centre line (n, 2) that crosses or touches itself: a position there has two values of progress.
-
-    Raises:
-        BadInput: it does.
-    """
+    """Refuse a centre line (n, 2) that crosses or touches itself: a position there has two values of progress."""
     line = shapely.LineString(center)
     pieces = shapely.get_parts(shapely.line_merge(shapely.unary_union(line, grid_size=_GRID_M)))
     longest = pieces[shapely.length(pieces).argmax()]
@@ -368,9 +362,6 @@ def _road_area(center: np.ndarray, inner: np.ndarray, outer: np.ndarray, closed:
 
     A closed course is the outer ring minus the inner one; an open one is the ring of the outer border
     followed by the inner one backwards.
-
-    Raises:
-        BadInput: The borders enclose no road, or not the one the centre line runs on.
     """
     ring = outer if closed else np.concatenate([outer, inner[::-1]])
     road = _area(ring).difference(_area(inner)) if closed else _area(ring)

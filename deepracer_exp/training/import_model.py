@@ -56,10 +56,7 @@ class Imported:
 def import_model(path: str, name: str, overrides: Sequence[str]) -> Imported:
     """Make a run and options of a model of the service; nothing of it is run.
 
-    Args:
-        path: the model's folder or archive.
-        name: of the experiment and the options.
-        overrides: of the experiment, and `checkpoint=best` or `last`, as the service marks its checkpoints.
+    `overrides` are those of the experiment, and `checkpoint=best` or `last`, as the service marks its checkpoints.
 
     Raises:
         BadInput: there is no model, it cannot be used here, or the run cannot be written; nothing is left.

@@ -55,7 +55,7 @@ from .budget import refuse_spent
 from .callbacks import standard_callbacks
 from .clone import describe_clone, read_parent
 from .kept_policy import keep_policy
-from .memory import memory_needed
+from .machine import memory_needed
 from .metrics import track_names
 from .plan import ResumePlan, TrainPlan
 from .rivals import kept_rival
@@ -67,33 +67,36 @@ logger = logging.getLogger("deepracer_exp")
 
 
 def run_training(
-    plan: TrainPlan,
+    plan: TrainPlan | ResumePlan,
     console: Console | None = None,
     callbacks: Sequence[Callback] = (),
     run_name: str | None = None,
     tags: Mapping[str, str] = MappingProxyType({}),
     created: Callable[[Path], None] | None = None,
 ) -> TrainResult:
-    """Train what was planned.
+    """Train what was planned: a new run, a clone, or the rest of a run from its last checkpoint.
 
     Args:
-        plan: of `plan_training` or `plan_clone`.
+        plan: of `plan_training`, `plan_clone` or `plan_resume`.
         console: shows the progress; None: nothing is shown.
         callbacks: called beside the standard ones, see `standard_callbacks`.
         run_name: of the run in MLflow; None: from the reward function and the time.
         tags: of the run in MLflow, beside its own.
-        created: called with the folder of the run before it is recorded anywhere else.
+        created: called with the folder of a new run before it is recorded anywhere else.
 
     Returns:
         How it ended; `reason` holds a failed run's error.
 
     Raises:
-        BadInput: before anything was started; no folder is left.
+        BadInput: before anything was started; no folder of a new run is left. A run cannot be resumed while it is
+            being trained, or with other values.
         TakenOver: a callback raised it.
     """
     console = console or Console(quiet=True)
     # Signals are caught from here on, so that Ctrl-C during the start leaves a whole folder, too.
     with Interruption(_printing(console)) as interruption:
+        if isinstance(plan, ResumePlan):
+            return _run(_reopen(plan, console, callbacks, run_name, tags), interruption)
         start = None
         if plan.parent is not None:
             start = read_parent(plan.parent, plan.experiment)
@@ -118,26 +121,6 @@ def store_run(plan: TrainPlan, networks: PolicyNetworks, reason: str) -> TrainRe
     setup = build_setup(plan.experiment, files=plan.files)
     trainer = _begin(plan, setup, Console(quiet=True), (networks, None))
     return trainer.end(Ending(FINISHED, reason), 0)
-
-
-def resume_training(
-    plan: ResumePlan,
-    console: Console | None = None,
-    callbacks: Sequence[Callback] = (),
-    run_name: str | None = None,
-    tags: Mapping[str, str] = MappingProxyType({}),
-) -> TrainResult:
-    """Resume a run that was killed, interrupted or failed from its last checkpoint.
-
-    Args as for `run_training`; the plan is of `plan_resume`, and changes nothing of what the run learns.
-
-    Raises:
-        BadInput: it is being trained, or was started with other values.
-        TakenOver: a callback raised it.
-    """
-    console = console or Console(quiet=True)
-    with Interruption(_printing(console)) as interruption:
-        return _run(_reopen(plan, console, callbacks, run_name, tags), interruption)
 
 
 def copy_run(run_dir: Path, attempt: int) -> Path:
@@ -172,11 +155,7 @@ def try_out(plan: TrainPlan) -> RaceSetup:
 
 
 def _try(experiment: Experiment, setup: RaceSetup) -> None:
-    """Run the reward function's module once, let the car stand, and look for the device.
-
-    Raises:
-        BadInput: one of them cannot be used.
-    """
+    """Run the reward function's module once, let the car stand, and look for the device."""
     algorithm = experiment.algorithm
     if isinstance(algorithm, SACConfig) and algorithm.value_network and setup.actions.n is not None:
         raise BadInput(

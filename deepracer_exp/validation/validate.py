@@ -383,13 +383,7 @@ def _print_first(out: Console, lines: list[str]) -> None:
 
 
 def _train_shortly(out: Console, err: Console, plan: TrainPlan) -> None:
-    """Train and print whether anything improves.
-
-    Raises:
-        BadInput: the experiment cannot be trained.
-        RunFailed: the training failed.
-        KeyboardInterrupt: it was interrupted.
-    """
+    """Train and print whether anything improves."""
     from deepracer_exp.training.run import run_training
 
     outcome = run_training(plan, err)

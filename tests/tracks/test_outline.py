@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 import shapely
 
-from deepracer_exp.tracks.outline import Outline
-from deepracer_exp.tracks.picture import draw_track, extent
+from deepracer_exp.tracks.outline import Outline, draw_track, extent
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from deepracer_exp.runs.files import read_metrics
 from deepracer_exp.runs.folder import RunFolder, is_held
 from deepracer_exp.runs.result import STOPPED_EARLY
 from deepracer_exp.training.plan import plan_resume, plan_training
-from deepracer_exp.training.run import copy_run, resume_training, run_training
+from deepracer_exp.training.run import copy_run, run_training
 from deepracer_exp.training.trainer import Callback, TakenOver
 
 from .conftest import assert_same_run
@@ -66,7 +66,7 @@ def test_a_copy_continues_as_the_run_would_have_while_its_folder_is_held(tmp_pat
     assert is_held(callback.dir)
     copy = copy_run(callback.dir, 2)
     assert copy.name == f"{callback.dir.name}-attempt2"
-    outcome = resume_training(plan_resume(copy, []))
+    outcome = run_training(plan_resume(copy, []))
     assert outcome.status == "finished"
     whole = run(tmp_path / "whole", None).folder
     assert_same_run(whole, copy)

@@ -1,17 +1,20 @@
-"""The line that the car drives: the fastest lap, sectors, speed and steering, the racing line, acceleration, slide."""
+"""The line that the car drives: sectors, speed, steering, slide and zig-zag, and what it loses to the fastest lap."""
 
 import numpy as np
 import pandas as pd
 
+from deepracer_exp.analysis.against_fastest import CAUSES, loss, lost_in_words
 from deepracer_exp.analysis.log_course import waypoint_positions
 from deepracer_exp.analysis.log_view import STARTING_STEPS, LogView, closest_waypoints
 from deepracer_exp.analysis.racing_line import center_line, minimum_curvature_line
-from deepracer_exp.analysis.sectors import sectors_now
+from deepracer_exp.analysis.sectors import sectors_now, sectors_of
 from deepracer_exp.analysis.statistics import MOST_ROWS, Values, means, quantiles, subsample
+from deepracer_exp.analysis.zigzag import CENTRED_DEG, zigzag_in_words, zigzag_now
 from deepracer_exp.errors import count
 
 from .figure import Chart, Layer, Panel, band, bars, color_range, colored_points, line, note, points
 from .maps import LEAST_STEPS, Grid, beside, map_panel, waypoint_panel
+from .runs import run_folder
 from .style import BLUE, CATEGORIES, INK, ORANGE, PALE, VERMILION
 
 GRIP_SHARE = 0.95
@@ -268,3 +271,70 @@ def _grip(rows: pd.DataFrame) -> float:
 def _without_gaps(values: Values) -> Values:
     """Return values with the gaps filled in, which are waypoints that one lap jumped over."""
     return pd.Series(values).interpolate(limit_direction="both").to_numpy()
+
+
+def zigzag(view: LogView) -> Chart | None:
+    """Draw the steering of the fastest lap, control step by control step, with the straights of the course."""
+    lap = view.fastest_lap("lap_position", "steer", "progress")
+    figures, where = zigzag_now(view)
+    if view.course is None or lap is None or figures is None:
+        return None
+    length_m = view.course.length_m
+    steer = lap["steer"].to_numpy(np.float64)
+    at_m = length_m * lap["lap_position"].to_numpy(np.float64)
+    # The lap ends where it began: the line must not lead back across the figure.
+    wraps = np.flatnonzero(np.abs(np.diff(at_m)) > length_m / 2) + 1
+    at_m, steer = (np.insert(values, wraps, np.nan) for values in (at_m, steer))
+    largest = max(float(np.nanmax(np.abs(steer))), CENTRED_DEG)
+    layers: list[Layer] = []
+    named = False
+    for sector in sectors_of(view.course):
+        if sector.name.startswith("straight"):
+            ends = [sector.begin * length_m, sector.end * length_m]
+            layers.append(band(ends, [-largest] * 2, [largest] * 2, PALE, None if named else "straight"))
+            named = True
+    layers += [
+        line([0.0, length_m], [0.0, 0.0], INK, width=1.0),
+        line(at_m, steer, BLUE, "steering of the fastest lap", width=1.5),
+    ]
+    return Chart(
+        name="zigzag",
+        title="Steering along the fastest lap, and the straights",
+        caption=f"Commanded steering at each control step, without smoothing; the straights of the centre line are "
+        f"shaded. On these: {zigzag_in_words(*figures)} ({where}). A line that jumps from one side of zero to the "
+        "other within a shaded part is zig-zag, but for the first time: that is the way from one bend into the next."
+        + " The lap of a training is one of drawn actions; the policy that races swerves less."
+        * view.trained,
+        rows=[
+            [
+                Panel(
+                    layers=layers,
+                    x_label="m along the centre line, from waypoint 0",
+                    y_label="steering, ° (left is positive)",
+                    x_range=(0.0, length_m),
+                )
+            ]
+        ],
+    )
+
+
+def against_fastest(view: LogView) -> Chart | None:
+    """Draw the seconds that a run's lap loses to the fastest lap of its car, by sector and cause."""
+    folder = run_folder(view)
+    lost = None if folder is None else loss(view, folder)
+    if lost is None:
+        return None
+    table = lost.by_sector
+    places, colors = np.arange(len(table)), dict(zip(CAUSES, (BLUE, ORANGE, VERMILION), strict=True))
+    layers = [
+        bars(places + 0.26 * (number - 1), table[cause].to_numpy(), colors[cause], cause, width=0.26)
+        for number, cause in enumerate(CAUSES)
+    ]
+    return Chart(
+        name="against_fastest",
+        title="Seconds lost to the fastest lap of this car",
+        caption=f"The fastest {view.lap_word} from the start line: {lost_in_words(lost)}. Line is a longer way, "
+        "steering the way that turning to and fro adds to it, speed the rest; below zero the lap gains. The fastest "
+        "lap itself: `deepracer-exp tracks NAME --fastest`.",
+        rows=[[Panel(layers=layers, y_label="seconds lost", x_names=list(table.index))]],
+    )

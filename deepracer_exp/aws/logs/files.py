@@ -266,9 +266,6 @@ def _unpack(
         inside: folders that the members are in; empty if the archive is all there is.
         beside: folders that the archive or compressed file is in.
         archives: opens the members.
-
-    Raises:
-        OSError: it cannot be read, or is neither an archive nor compressed.
     """
     try:
         with open_archive(path) as archive:

@@ -112,9 +112,7 @@ class _Files:
 def read_model(path: str, checkpoint: str) -> StoredModel:
     """Read the weights of a model and the files beside them.
 
-    Args:
-        path: of its folder or archive.
-        checkpoint: `best` or `last`, of `deepracer_checkpoints.json`.
+    `checkpoint` is `best` or `last`, of `deepracer_checkpoints.json`.
 
     Raises:
         BadInput: there is no such file, it is corrupt or larger than a model, or holds none or several.
@@ -254,11 +252,7 @@ def _packed(path: str, archive: Archive) -> _Files:
 def checkpoint_files(tensors: Tensors, number: int, steps: int, progress: float | None) -> dict[str, bytes]:
     """Return the files of a model's only checkpoint by their names.
 
-    Args:
-        tensors: the weights, as the service names them.
-        number: of the checkpoint.
-        steps: control steps driven before it.
-        progress: mean progress of its evaluation in per cent; None without one.
+    `progress` is the mean of its evaluation in per cent, None without one; `steps` were driven before it.
     """
     name = f"{number}_Step-{steps}.ckpt"
     evaluated = {"name": name, "avg_eval_metric": progress, "time_stamp": time.time()}

@@ -30,9 +30,7 @@ def full_scale(metadata: ModelMetadata) -> Action:
 def steering_share(steering_deg: ArrayLike, full_lock_deg: float) -> Floats:
     """Return steering as a share of full lock; beyond 1 where a continuous space reaches further to the right.
 
-    Args:
-        steering_deg: of the actions, positive to the left, any shape.
-        full_lock_deg: of `full_scale`; with 0 or less the car only drives straight ahead.
+    With a `full_lock_deg` of 0 or less, of `full_scale`, the car only drives straight ahead.
     """
     steering_deg = np.asarray(steering_deg, np.float64)
     return steering_deg / full_lock_deg if full_lock_deg > 0 else np.zeros_like(steering_deg)
@@ -41,9 +39,7 @@ def steering_share(steering_deg: ArrayLike, full_lock_deg: float) -> Floats:
 def throttle(speed_mps: ArrayLike, full_throttle_mps: float) -> Floats:
     """Return the throttle, 0 to 1: a parabola through 0, `HALF_SPEED_THROTTLE` at half speed and 1 at full speed.
 
-    Args:
-        speed_mps: of the actions, any shape.
-        full_throttle_mps: of `full_scale`; with 0 the car stands.
+    With a `full_throttle_mps` of 0, of `full_scale`, the car stands.
     """
     speed_mps = np.asarray(speed_mps, np.float64)
     share = speed_mps / full_throttle_mps if full_throttle_mps > 0 else np.zeros_like(speed_mps)

@@ -81,12 +81,10 @@ def read_hyperparameters(
 ) -> Hyperparameters:
     """Read a hyperparameters.json.
 
-    Missing keys get the service's defaults, numbers may be written as strings, unknown keys are ignored.
+    `raw` is the file's content if known. `refused` collects errors of single keys, which then get the service's
+    defaults; with None they are raised.
 
-    Args:
-        path: the file.
-        raw: the file's content if known.
-        refused: a list for errors of single keys, which then get the service's defaults; None: raise them.
+    Missing keys get the service's defaults, numbers may be written as strings, unknown keys are ignored.
 
     Raises:
         BadInput: the file cannot be read or has values the service's trainer does not accept; one line with

@@ -73,11 +73,9 @@ class JobSettings:
 def read_run_env(path: str, workers: Mapping[int, str]) -> tuple[JobSettings, ...]:
     """Read deepracer-for-cloud's run.env, and the worker-N.env that hold for its further workers.
 
-    A worker's file has what differs from the worker before it.
+    `workers` are the paths of worker-N.env by N, which count if run.env says that workers differ.
 
-    Args:
-        path: of run.env.
-        workers: paths of worker-N.env by N, which count if run.env says that workers differ.
+    A worker's file has what differs from the worker before it.
 
     Raises:
         BadInput: a file cannot be read or has a value that the service does not accept.

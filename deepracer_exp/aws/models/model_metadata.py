@@ -76,11 +76,9 @@ class ModelMetadata:
 def read_model_metadata(path: str | Path, raw: bytes | None = None) -> ModelMetadata:
     """Read a model_metadata.json of any version from 1 to 6.
 
-    Missing keys get the service's defaults, numbers may be written as strings, unknown keys are ignored.
+    `raw` is the file's content if known.
 
-    Args:
-        path: the file.
-        raw: the file's content if known.
+    Missing keys get the service's defaults, numbers may be written as strings, unknown keys are ignored.
 
     Raises:
         BadInput: the file cannot be read or holds something the service would not accept; one line with

@@ -52,9 +52,7 @@ class Entry(NamedTuple):
 def read_index(raw: bytes, where: str) -> dict[str, Entry]:
     """Return the entries of an `.index` by name, in the order of the names.
 
-    Args:
-        raw: its content, at most `INDEX_BYTES`.
-        where: the file, for messages.
+    `raw` is its content, at most `INDEX_BYTES`; `where` is the file, for messages.
 
     Raises:
         BadInput: it is not an index, is corrupt, or describes tensors that no network of the service has.

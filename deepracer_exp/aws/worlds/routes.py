@@ -47,11 +47,10 @@ class Knots:
 def read_route(path: str | Path) -> np.ndarray:
     """Read a route file.
 
+    The file is a `.npy` of shape (n, 6).
+
     Rows whose centre repeats the one before are kept: they count in the service's waypoint numbers, as recordings of
     such courses show.
-
-    Args:
-        path: A `.npy` file of shape (n, 6).
 
     Returns:
         Rows (n, 6) float64: centre x, y, inner x, y, outer x, y in metres. The course is closed if and
@@ -238,9 +237,6 @@ def _unfold(border: np.ndarray, longest_m: float, closed: bool) -> np.ndarray:
         border: Points (n, 2); on a closed course the last equals the first.
         longest_m: Longest fold that is pulled together.
         closed: Whether the border is a ring.
-
-    Raises:
-        BadInput: A crossing that is no such fold.
     """
     border = border.copy()
     last = len(border) - 1

@@ -61,9 +61,9 @@ class Driver:
         """
         self._config.folder.mkdir(parents=True, exist_ok=True)
         # Workers killed on this machine, mostly with their driver: their trials need not wait until a lease runs out.
-        found = self._look()
-        self._ended_before = frozenset(one.trial.number for one in found if one.has_ended)
-        for owner in {one.owner for one in found if not one.has_ended and is_gone(one.owner)}:
+        claims = self._look()
+        self._ended_before = frozenset(claim.trial.number for claim in claims if claim.has_ended)
+        for owner in {claim.owner for claim in claims if not claim.has_ended and is_gone(claim.owner)}:
             self._release(owner)
         try:
             for _ in range(self._launcher.workers):
@@ -91,15 +91,15 @@ class Driver:
 
     def _replace_lost_workers(self) -> None:
         """Release the trials of workers that are gone, and start others instead."""
-        for one in [one for one in self._running if one.exitcode is not None]:
-            self._running.remove(one)
+        for worker in [worker for worker in self._running if worker.exitcode is not None]:
+            self._running.remove(worker)
             # A reward function can end its process with 0, too.
-            if one.exitcode == 0 and patiently(self._is_done, self._config.config.patience_s):
+            if worker.exitcode == 0 and patiently(self._is_done, self._config.config.patience_s):
                 self._all_made = True
                 continue
-            if one.owner is not None and one.is_seen:
-                self._release(one.owner, is_lost=True)
-            if one.exitcode == RunFailed.exit_code:
+            if worker.owner is not None and worker.is_seen:
+                self._release(worker.owner, is_lost=True)
+            if worker.exitcode == RunFailed.exit_code:
                 raise RunFailed(f"the study's database does not answer; {self._how_to_resume()}")
             if self._all_made:
                 continue
@@ -108,15 +108,15 @@ class Driver:
                 logs = [str(log) for log in self._config.folder.glob("workers*.log") if log.stat().st_size]
                 why = f"see {' and '.join(logs)}" if logs else "a reward function can do that"
                 raise RunFailed(
-                    f"workers keep dying, the last one with exit code {one.exitcode}; {why}; "
+                    f"workers keep dying, the last one with exit code {worker.exitcode}; {why}; "
                     f"{self._how_to_resume()}"
                 )
             self._start()
         if self._all_made:
             # Workers that still wait for room on a cluster are not needed.
-            for one in [one for one in self._running if one.owner is None]:
-                self._running.remove(one)
-                one.kill()
+            for worker in [worker for worker in self._running if worker.owner is None]:
+                self._running.remove(worker)
+                worker.kill()
 
     def _release(self, owner: str, *, is_lost: bool = False, patience_s: float | None = None) -> None:
         patiently(
@@ -129,14 +129,14 @@ class Driver:
 
     def _look(self) -> list[Claim]:
         claims = patiently(self._claims.all, self._config.config.patience_s)
-        ended = sum(one.has_ended for one in claims)
+        ended = sum(claim.has_ended for claim in claims)
         if ended != self._ended:
             self._ended, self._losses = ended, 0
             self._on_ended(claims)
         return claims
 
     def _give_up_if_all_fail(self, claims: Sequence[Claim]) -> None:
-        ended = [one.trial for one in claims if one.has_ended]
+        ended = [claim.trial for claim in claims if claim.has_ended]
         if any(trial.state != "FAIL" for trial in ended):
             return
         # Failures of an earlier start do not count: their cause may be mended.
@@ -152,21 +152,21 @@ class Driver:
 
     def _end(self) -> None:
         """Ask the workers to end, and wait for them."""
-        for one in self._running:
-            one.terminate()
+        for worker in self._running:
+            worker.terminate()
         until = time.monotonic() + _LEAVE_S
-        for one in self._running:
-            one.join(max(until - time.monotonic(), 0.1))
+        for worker in self._running:
+            worker.join(max(until - time.monotonic(), 0.1))
         self._kill()
 
     def _kill(self) -> None:
-        for one in self._running:
-            one.kill()
-            if one.owner is None or not one.is_seen:
+        for worker in self._running:
+            worker.kill()
+            if worker.owner is None or not worker.is_seen:
                 continue
             # If the database is away, the trial is free once its lease has run out.
             with contextlib.suppress(RunFailed):
-                self._release(one.owner, patience_s=1.0)
+                self._release(worker.owner, patience_s=1.0)
         self._running.clear()
 
     def _how_to_resume(self) -> str:

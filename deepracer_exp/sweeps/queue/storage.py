@@ -84,8 +84,8 @@ class Database:
             "tcp_user_timeout": 30_000,
             "options": f"-c idle_in_transaction_session_timeout={_STUCK_S}s -c lock_timeout={_STUCK_S}s",
         }
-        given = {key: value for key, value in arguments.items() if key not in self.url.query}
-        return {"poolclass": sa.NullPool, "connect_args": given}
+        chosen = {key: value for key, value in arguments.items() if key not in self.url.query}
+        return {"poolclass": sa.NullPool, "connect_args": chosen}
 
     @contextmanager
     def creation_lock(self, engine: sa.Engine) -> Iterator[None]:
@@ -241,11 +241,7 @@ def _write_ahead(file: Path) -> None:
 
 
 def _is_ready(database: Database, engine: sa.Engine) -> bool:
-    """Return whether all of Optuna's tables exist; it writes the version last.
-
-    Raises:
-        BadInput: there is a version without the tables: that of another program.
-    """
+    """Return whether all of Optuna's tables exist; it writes the version last."""
     with engine.connect() as connection:
         tables = set(sa.inspect(connection).get_table_names())
         if "alembic_version" not in tables:

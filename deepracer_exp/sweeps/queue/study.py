@@ -19,8 +19,8 @@ from deepracer_exp.sweeps.search.objectives import MEASURES
 from deepracer_exp.sweeps.search.space import SearchSpace
 
 from .claims import TABLE
-from .parent import Parent
 from .storage import open_storage
+from .worker_config import Parent
 
 MAY_DIFFER = (
     *("study", "debug", "sweep/executor", "sweep.trials", "sweep.workers", "sweep.storage", "sweep.lease_s"),
@@ -54,10 +54,10 @@ def load_study(name: str, storage: RDBStorage) -> Study:
     """
     study = find_study(name, storage)
     if study is None:
-        known = optuna.get_all_study_names(storage)
-        there = f"studies: {', '.join(known)}" if known else "there is no study yet"
+        names = optuna.get_all_study_names(storage)
+        there = f"studies: {', '.join(names)}" if names else "there is no study yet"
         raise BadInput(
-            f"study {name}", f"not found in {redact(str(storage.engine.url))}{nearest(name, known)}; {there}"
+            f"study {name}", f"not found in {redact(str(storage.engine.url))}{nearest(name, names)}; {there}"
         )
     return study
 
@@ -78,20 +78,20 @@ def with_stored(
         BadInput: an override is not accepted, there is nothing to search, or there is no study of that name to resume.
     """
     names_only = _names_only(overrides)
-    known = _known(request, names_only)
-    if known is None:
+    study = _existing(request, names_only)
+    if study is None:
         return overrides, request, None
     if names_only:
         # The total of the last start: it may have been raised since the study was begun.
-        total = [f"sweep.trials={known.user_attrs['trials']}"] if "trials" in known.user_attrs else []
-        overrides = [*known.user_attrs.get("overrides", ()), *total, *overrides]
+        total = [f"sweep.trials={study.user_attrs['trials']}"] if "trials" in study.user_attrs else []
+        overrides = [*study.user_attrs.get("overrides", ()), *total, *overrides]
         request = compose_sweep(overrides, stored=True)
     if not request.space:
         raise BadInput(
             f"study={request.study}: exists; to resume it, give only {', '.join(MAY_DIFFER)} beside its "
             "name; for anything else give the whole search again"
         )
-    return overrides, request, known
+    return overrides, request, study
 
 
 def open_study(
@@ -123,8 +123,8 @@ def open_study(
         "space": space.as_text(),
     }
     directions = [
-        StudyDirection.MINIMIZE if MEASURES[one].minimize else StudyDirection.MAXIMIZE
-        for one in sweep.objectives
+        StudyDirection.MINIMIZE if MEASURES[objective].minimize else StudyDirection.MAXIMIZE
+        for objective in sweep.objectives
     ]
     try:
         study = optuna.create_study(study_name=name, storage=storage, directions=directions)
@@ -135,10 +135,10 @@ def open_study(
         for key, value in wanted.items():
             study.set_user_attr(key, value)
     else:
-        found = [*space.difference(stored["space"]), *_differences(stored, wanted)]
-        if found:
+        differences = [*space.difference(stored["space"]), *_differences(stored, wanted)]
+        if differences:
             raise BadInput(
-                f"study={name}: exists with another search: {'; '.join(found)}; give another name, or "
+                f"study={name}: exists with another search: {'; '.join(differences)}; give another name, or "
                 f"resume it with `deepracer-exp sweep study={name}` alone"
             )
     study.set_user_attr("trials", sweep.trials)
@@ -150,15 +150,15 @@ def open_study(
 
 
 def _differences(stored: dict[str, object], wanted: dict[str, object]) -> list[str]:
-    found = [f"{key}: {stored.get(key)} -> {wanted[key]}" for key in _SAME if stored.get(key) != wanted[key]]
+    lines = [f"{key}: {stored.get(key)} -> {wanted[key]}" for key in _SAME if stored.get(key) != wanted[key]]
     before, now = (
-        [line for line in one if not _says_where(line)] if isinstance(one, list) else []
-        for one in (stored.get("base"), wanted["base"])
+        [line for line in base if not _says_where(line)] if isinstance(base, list) else []
+        for base in (stored.get("base"), wanted["base"])
     )
     if before != now:
-        gone, new = [one for one in before if one not in now], [one for one in now if one not in before]
-        found.append(f"every trial: {' '.join(gone) or 'nothing'} -> {' '.join(new) or 'nothing'}")
-    return found
+        gone, new = [line for line in before if line not in now], [line for line in now if line not in before]
+        lines.append(f"every trial: {' '.join(gone) or 'nothing'} -> {' '.join(new) or 'nothing'}")
+    return lines
 
 
 def _says_where(override: str) -> bool:
@@ -166,7 +166,7 @@ def _says_where(override: str) -> bool:
     return group_of(override) == "collector" and key_of(override) != "collector.cars"
 
 
-def _known(request: SweepRequest, must_exist: bool) -> Study | None:
+def _existing(request: SweepRequest, must_exist: bool) -> Study | None:
     """Return the study that the request names, if it exists; no file is created by looking."""
     if request.entry.study is None:
         return None

@@ -40,14 +40,13 @@ from deepracer_exp.tracking.study_run import TRIAL, end_trial_run, open_trial_ru
 from deepracer_exp.tracking.tracking_file import Status
 from deepracer_exp.training.budget import RunEnded
 from deepracer_exp.training.plan import TrainPlan, plan_resume
-from deepracer_exp.training.run import copy_run, resume_training, run_training
+from deepracer_exp.training.run import copy_run, run_training
 from deepracer_exp.training.signals import Interruption
 from deepracer_exp.training.trainer import Callback, TakenOver, Trainer, TrainResult
 
 from .claims import Claim, Lease, TrialClaims, report_results
-from .parent import plan_trial
 from .storage import patiently, resolve_database
-from .worker_config import WorkerConfig
+from .worker_config import WorkerConfig, plan_trial
 
 Value = TypeVar("Value")
 
@@ -203,7 +202,7 @@ class TrialRun(Callback):
         value = intermediate_value(row, self._config.config.objectives[0], self._config.protocol.time_s)
         if value is None or self._seed > 0:
             return
-        decision = self._patiently(lambda: self._asked(value))
+        decision = self._patiently(lambda: self._pruned(value))
         if decision is not None:
             trainer.request_stop(Ending.by_rule(*decision, STOPPED_EARLY))
 
@@ -226,7 +225,7 @@ class TrialRun(Callback):
         share = (self._seed + min(spent, 1.0)) / self._config.config.seeds
         self._lease.progress = {**row, "params": self._trial.params, "share": share}
 
-    def _asked(self, value: float) -> PruneDecision | None:
+    def _pruned(self, value: float) -> PruneDecision | None:
         """Report an evaluation to Optuna, and return what the pruners decide."""
         if len(self._config.config.objectives) > 1:
             return None  # Optuna compares trials by one number only.
@@ -308,22 +307,22 @@ class TrialRun(Callback):
         return replace(run, took_s=round(time.monotonic() - began, 1))
 
     def _trained(self, overrides: Sequence[str]) -> TrainResult:
-        own = [*overrides, f"name={self._config.study}", f"runs_dir={self._config.runs_dir}"]
+        usual = [*overrides, f"name={self._config.study}", f"runs_dir={self._config.runs_dir}"]
         # Where a trial's cars drive is no part of it, and left out of the command that repeats it.
-        given = {key_of(override) for override in overrides}
+        keys = {key_of(override) for override in overrides}
         where: list[str] = []
-        if not given & {"collector", "collector.mode", "collector.processes"}:
+        if not keys & {"collector", "collector.mode", "collector.processes"}:
             where = ["collector.mode=in_process", "collector.processes=null"]
-        if "collector.threads" not in given:
+        if "collector.threads" not in keys:
             where.append(f"collector.threads={self._config.cores}")
-        own += where if "report" in given else [*where, "report=false"]
-        plan = self._planned(own)
+        usual += where if "report" in keys else [*where, "report=false"]
+        plan = self._planned(usual)
         experiment = plan.experiment
         if experiment.observation.camera is not None:
             # Several threads update such networks, and the last digits depend on how many.
             self._patiently(lambda: self._trial.set_user_attr("where", where))
         if self._seed:
-            plan = self._planned([*own, f"seed={experiment.seed + self._seed}"])
+            plan = self._planned([*usual, f"seed={experiment.seed + self._seed}"])
         title, tags = self._title_and_tags()
         return run_training(plan, None, [self], run_name=title, tags=tags, created=self._begin)
 
@@ -340,7 +339,7 @@ class TrialRun(Callback):
         title, tags = self._title_and_tags()
         try:
             plan = plan_resume(run_dir, [])
-            return resume_training(plan, None, [self], run_name=title, tags=tags)
+            return run_training(plan, None, [self], run_name=title, tags=tags)
         except RunEnded:
             summary = read_object(run_dir / SUMMARY)
             ending = Ending.stored(summary)
@@ -351,12 +350,14 @@ class TrialRun(Callback):
         """Count another attempt at a run; return it as failed if its process was lost each time so far."""
         run_dir = Path(run.run_dir or "")
         checkpoints = kept_checkpoints(run_dir / CHECKPOINTS)
-        at = max((int(path.name) for path in checkpoints if path.name.isdecimal()), default=0)
-        lost = run.tries if run.tried_at == at else 0
-        self._record(replace(run, tried_at=at, tries=lost + 1))
+        iteration = max((int(path.name) for path in checkpoints if path.name.isdecimal()), default=0)
+        lost = run.tries if run.tried_at == iteration else 0
+        self._record(replace(run, tried_at=iteration, tries=lost + 1))
         if lost < _MOST_TRIES:
             return None
-        reason = f"its worker was lost {lost} times after iteration {at}: killed, or ended by what it ran"
+        reason = (
+            f"its worker was lost {lost} times after iteration {iteration}: killed, or ended by what it ran"
+        )
         last = (_rows(run_dir) or [{}])[-1]
         env_steps, wall_clock_s = last.get("env_steps", 0), last.get("wall_clock_s", 0.0)
         return _as_failed(replace(run, env_steps=env_steps, wall_clock_s=wall_clock_s), reason, reason)
@@ -393,8 +394,8 @@ class TrialRun(Callback):
         store, study_run_id = self._config.store, self._config.study_run_id
         if store is None or study_run_id is None or self._config.config.seeds == 1:
             return study_run_id
-        found = open_trial_run(store, self._config.study, self._number, study_run_id, overrides)
-        return found or study_run_id
+        trial_run_id = open_trial_run(store, self._config.study, self._number, study_run_id, overrides)
+        return trial_run_id or study_run_id
 
     def _track(self, ended: Trial) -> None:
         """Write the trial's result to MLflow, beside what its runs have logged."""

@@ -128,9 +128,7 @@ def write_best(study: optuna.Study, runs_dir: Path) -> Path:
 def over_seeds(study: optuna.Study, keys: dict[str, str]) -> list[dict[str, Any]]:
     """Return the best trials with several seeds, by the first objective: each as texts, beside the best trial.
 
-    Args:
-        study: empty where its trials have one seed each.
-        keys: short names of the parameters.
+    `keys` are short names of the parameters. Nothing where the study's trials have one seed each.
     """
     objective = objectives_of(study)[0]
     repeated = [(trial, values) for trial in complete_trials(study) if len(values := _values(trial)) > 1]

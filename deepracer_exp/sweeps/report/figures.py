@@ -205,8 +205,8 @@ def _label_choices(axis: go.layout.XAxis, panel_width: float) -> None:
     axis.update(tickangle=0 if upright else -90)
 
 
-def wrapped(text: str, width: int, most: int = 4) -> str:
-    """Return a text in up to `most` lines of at most `width` characters, broken after `_`, `-` and `,` if possible."""
+def wrapped(text: str, width: int) -> str:
+    """Return a text in up to four lines of at most `width` characters, broken after `_`, `-` and `,` if possible."""
     lines = [""]
     for part in re.split(r"(?<=[_,\- ])", text):
         while part:
@@ -216,8 +216,8 @@ def wrapped(text: str, width: int, most: int = 4) -> str:
                 continue
             lines[-1] += part[:room]
             part = part[room:]
-    if len(lines) > most:
-        lines = [*lines[: most - 1], f"{lines[most - 1][: width - 1]}…"]
+    if len(lines) > 4:
+        lines = [*lines[:3], f"{lines[3][: width - 1]}…"]
     return "<br>".join(html.escape(line, quote=False) for line in lines)
 
 

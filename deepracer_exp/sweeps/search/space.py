@@ -60,41 +60,41 @@ class SearchSpace:
             BadInput: there is nothing to search, a key does not exist, or no run accepts one of its values.
         """
         request.refuse_empty()
-        found = {key: dimension(key, text) for key, text in request.space.items()}
-        trials = _Trials(request, check, found)
+        ranges = {key: dimension(key, text) for key, text in request.space.items()}
+        trials = _Trials(request, check, ranges)
         dimensions = [
             Dimension(key, request.space[key], _distribution(what), *trials.condition(key))
-            for key, what in sorted(found.items(), key=lambda item: item[0] not in groups())
+            for key, what in sorted(ranges.items(), key=lambda item: item[0] not in groups())
             if key not in request.optional or trials.is_known(key)
         ]
-        for one in dimensions:
-            trials.check(one)
+        for axis in dimensions:
+            trials.check(axis)
         return cls(request.base, tuple(dimensions))
 
     def suggest(self, trial: BaseTrial) -> list[str]:
         """Return the overrides of a trial; equal values give equal overrides, to the last digit."""
         chosen: dict[str, Choice] = {}
-        for one in self.dimensions:
-            if one.options is None or (one.group and chosen[one.group] in one.options):
-                chosen[one.key] = _suggested(trial, one)
+        for axis in self.dimensions:
+            if axis.options is None or (axis.group and chosen[axis.group] in axis.options):
+                chosen[axis.key] = _suggested(trial, axis)
         return [*self.base, *(as_override(key, value) for key, value in chosen.items())]
 
     def example(self) -> list[str]:
         """Return the overrides of a trial with the first choices and the lower ends."""
-        values = {one.key: _first(one.distribution) for one in self.dimensions}
+        values = {axis.key: _first(axis.distribution) for axis in self.dimensions}
         return self.suggest(FixedTrial(values))
 
     def as_text(self) -> dict[str, str]:
         """Return the expressions by key."""
-        return {one.key: one.expression for one in self.dimensions}
+        return {axis.key: axis.expression for axis in self.dimensions}
 
     def difference(self, other: Mapping[str, str]) -> list[str]:
         """Return a line for each key that another space, from its `as_text`, searches differently."""
-        own, lines = self.as_text(), []
-        for key in dict.fromkeys([*other, *own]):
-            before, now = other.get(key), own.get(key)
+        here, lines = self.as_text(), []
+        for key in dict.fromkeys([*other, *here]):
+            before, now = other.get(key), here.get(key)
             if before is None or now is None:
-                lines.append(f"{key}: {before or 'not searched'} -> {now or 'not searched'}")
+                lines.append(f"{key}: {before or 'not axis'} -> {now or 'not axis'}")
             elif before != now and dimension(key, before) != dimension(key, now):
                 lines.append(f"{key}: {before} -> {now}")
         return lines
@@ -106,28 +106,28 @@ class SearchSpace:
             BadInput: a key has infinitely many values, or counts for some options only.
         """
         grid: dict[str, list[Choice]] = {}
-        for one in self.dimensions:
-            if one.options is not None:
+        for axis in self.dimensions:
+            if axis.options is not None:
                 raise BadInput(
-                    f"sweep.sampler=grid: {one.key} counts only for {one.group}={','.join(map(str, one.options))}, "
+                    f"sweep.sampler=grid: {axis.key} counts only for {axis.group}={','.join(map(str, axis.options))}, "
                     "and a grid has no conditions; accepted: another sampler, or one option"
                 )
-            what = dimension(one.key, one.expression)
+            what = dimension(axis.key, axis.expression)
             values = list(what.values) if isinstance(what, Choices) else what.values()
             if values is None:
                 raise BadInput(
-                    f"sweep.sampler=grid: {one.key}={one.expression} has infinitely many values; accepted: A,B, "
+                    f"sweep.sampler=grid: {axis.key}={axis.expression} has infinitely many values; accepted: A,B, "
                     "range(FROM,BELOW,STEP), int(interval(LOW,HIGH)), or another sampler"
                 )
-            grid[one.key] = list(values)
+            grid[axis.key] = list(values)
         return grid
 
 
 class _Trials:
     """Composed experiments, to check values with."""
 
-    def __init__(self, request: SweepRequest, check: Check | None, found: Mapping[str, Choices | Range]):
-        self._base, self._found = list(request.base), found
+    def __init__(self, request: SweepRequest, check: Check | None, ranges: Mapping[str, Choices | Range]):
+        self._base, self._ranges = list(request.base), ranges
         self._stored = request.stored
         self._on_the_car = request.protocol.real_car is not None
         self._from_scratch = check is None
@@ -138,7 +138,9 @@ class _Trials:
             self._values({})
         except BadInput:
             # The base may be complete only with the searched keys, such as where one of two keys is null.
-            self._context = {key: _lines(key, what)[0] for key, what in found.items() if not self._group(key)}
+            self._context = {
+                key: _lines(key, what)[0] for key, what in ranges.items() if not self._group(key)
+            }
             self._values({})
 
     def condition(self, key: str) -> tuple[str | None, tuple[Choice, ...] | None]:
@@ -157,36 +159,36 @@ class _Trials:
             return self._has(self._values({}), key)
         return any(self._has(self._with(group, option), key) for option in self._options(group))
 
-    def check(self, one: Dimension) -> None:
+    def check(self, axis: Dimension) -> None:
         """Refuse a key that does not exist and values that no run accepts."""
-        what = self._found[one.key]
+        what = self._ranges[axis.key]
         options: Sequence[Choice | None] = [None]
-        if one.group is not None:
-            options = one.options or self._options(one.group)
+        if axis.group is not None:
+            options = axis.options or self._options(axis.group)
         for option in options:
-            context = {} if one.group is None else {one.group: as_override(one.group, option)}
-            for line in _lines(one.key, what):
-                self._check_line(context, one, line)
+            context = {} if axis.group is None else {axis.group: as_override(axis.group, option)}
+            for line in _lines(axis.key, what):
+                self._check_line(context, axis, line)
 
-    def _check_line(self, context: Mapping[str, str], one: Dimension, line: str) -> None:
+    def _check_line(self, context: Mapping[str, str], axis: Dimension, line: str) -> None:
         try:
             values = self._values(context)
             changed = copy.deepcopy(dict(values))
-            holder = _holder(changed, one.key)
-            if self._from_scratch and one.key not in groups() and holder is not None:
+            holder = _holder(changed, axis.key)
+            if self._from_scratch and axis.key not in groups() and holder is not None:
                 # Composing takes a hundred times as long as setting a value.
-                holder[one.key.rpartition(".")[2]] = override_value(line)
+                holder[axis.key.rpartition(".")[2]] = override_value(line)
                 if not self._stored:
                     allow(changed)
                 self._read(parse_experiment(changed))
             else:
-                self._values({**context, one.key: line})
+                self._values({**context, axis.key: line})
         except Unknown:
             raise
         except BadInput as error:
-            accepts_whole = isinstance(self._found[one.key], Range) and _is_of_whole_numbers(error)
-            hint = f"; of whole numbers: {one.key}='int({one.expression})'" if accepts_whole else ""
-            raise BadInput(f"{one.key}={one.expression}", f"{error}{hint}") from None
+            accepts_whole = isinstance(self._ranges[axis.key], Range) and _is_of_whole_numbers(error)
+            hint = f"; of whole numbers: {axis.key}='int({axis.expression})'" if accepts_whole else ""
+            raise BadInput(f"{axis.key}={axis.expression}", f"{error}{hint}") from None
 
     def _values(self, lines: Mapping[str, str]) -> Mapping[str, Any]:
         """Return all values of the base with these overrides by key; refuse what no run accepts."""
@@ -211,12 +213,12 @@ class _Trials:
         return self._values({group: as_override(group, option)})
 
     def _options(self, group: str) -> tuple[Choice, ...]:
-        what = self._found[group]
+        what = self._ranges[group]
         return what.values if isinstance(what, Choices) else tuple(what.values() or ())
 
     def _group(self, key: str) -> str | None:
         group, dot, _ = key.partition(".")
-        return group if dot and group in self._found and group in groups() else None
+        return group if dot and group in self._ranges and group in groups() else None
 
     def _has(self, values: Mapping[str, Any], key: str) -> bool:
         if key.startswith(f"{_CONSTANTS}."):
@@ -261,12 +263,12 @@ def _first(what: BaseDistribution) -> Choice:
     return what.low
 
 
-def _suggested(trial: BaseTrial, one: Dimension) -> Choice:
-    what = one.distribution
+def _suggested(trial: BaseTrial, axis: Dimension) -> Choice:
+    what = axis.distribution
     if isinstance(what, IntDistribution):
-        return trial.suggest_int(one.key, what.low, what.high, step=what.step, log=what.log)
+        return trial.suggest_int(axis.key, what.low, what.high, step=what.step, log=what.log)
     if isinstance(what, FloatDistribution):
-        return trial.suggest_float(one.key, what.low, what.high, step=what.step, log=what.log)
+        return trial.suggest_float(axis.key, what.low, what.high, step=what.step, log=what.log)
     assert isinstance(what, CategoricalDistribution)
-    value: Choice = trial.suggest_categorical(one.key, what.choices)
+    value: Choice = trial.suggest_categorical(axis.key, what.choices)
     return value
