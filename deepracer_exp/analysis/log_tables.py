@@ -192,13 +192,8 @@ def headline(view: LogView) -> str:
         races = count(view.episodes["stream"].nunique(), "race")
         sentence = f"No training; {steps} in {finished} of {races}"
     if not laps:
-        return f"{sentence}; {_without_a_lap(with_resets)}."
+        resets = f"no lap without a reset, {count(with_resets, 'complete lap')} with resets"
+        return f"{sentence}; {resets if with_resets else 'no complete lap'}."
     more = f"; {count(with_resets, 'more lap')} with resets" if with_resets else ""
     best = f", the fastest in {best_s:.2f} s" if math.isfinite(best_s) else ""
     return f"{sentence}; {count(laps, f'complete {view.lap_word}')}{best}{more}."
-
-
-def _without_a_lap(with_resets: int) -> str:
-    if not with_resets:
-        return "no complete lap"
-    return f"no lap without a reset, {count(with_resets, 'complete lap')} with resets"

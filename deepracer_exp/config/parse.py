@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
+from functools import cache
 from typing import Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
@@ -16,8 +17,6 @@ from .own_class import GROUPS, load_class, own_classes
 from .track import TrackConfig
 
 Config = TypeVar("Config")
-
-_adapters: dict[type, TypeAdapter[Any]] = {}
 
 
 def parse_experiment(mapping: dict[str, Any]) -> Experiment:
@@ -39,16 +38,16 @@ def parse_config(mapping: dict[str, Any], kind: type[Config]) -> Config:
     """
     try:
         # JSON is the strict mode that still takes a YAML list for a tuple and 1 for 1.0.
-        return _adapter(kind).validate_json(json.dumps(mapping), strict=True, extra="forbid")
+        adapter: TypeAdapter[Config] = _adapter(kind)
+        return adapter.validate_json(json.dumps(mapping), strict=True, extra="forbid")
     except ValidationError as error:
         raise _first_finding(mapping, error) from error
 
 
-def _adapter(kind: type[Config]) -> TypeAdapter[Config]:
+@cache
+def _adapter(kind: type) -> TypeAdapter[Any]:
     # Building an adapter takes longer than ten validations.
-    if kind not in _adapters:
-        _adapters[kind] = TypeAdapter(kind)
-    return _adapters[kind]
+    return TypeAdapter(kind)
 
 
 def _check_combinations(experiment: Experiment) -> None:

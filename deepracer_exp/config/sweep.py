@@ -172,7 +172,11 @@ def compose_sweep(overrides: Sequence[str], *, stored: bool = False) -> SweepReq
         BadInput: an override cannot be parsed, or one for the sweep has an unknown key or a value that is not accepted.
             Keys of the training are not checked.
     """
-    of_the_sweep = [override for override in overrides if _is_of_the_sweep(override)]
+    of_the_sweep = [
+        override
+        for override in overrides
+        if (key := key_of(override)) in _OF_THE_SWEEP or key.startswith("sweep.")
+    ]
     for override in of_the_sweep:
         _check_own(override)
     composition = compose_entry(_ENTRY, of_the_sweep, stored=stored)
@@ -209,7 +213,9 @@ class _TrainOverrides:
         searched = self.space.pop(key, None) is not None
         self.base.pop(key, None)
         if parsed.is_sweep_override():
-            _check_searched(key, override)
+            for refused, why in _NOT_SEARCHED.items():
+                if key == refused or key.startswith(f"{refused}."):
+                    raise BadInput(override, f"cannot be searched: {why}")
             self.space[key] = plain_expression(parsed, override.partition("=")[2])
             searched_values = dimension(key, self.space[key])
             if key in groups() and isinstance(searched_values, Choices):
@@ -218,11 +224,6 @@ class _TrainOverrides:
         elif not (parsed.is_delete() and searched):
             self.base[key] = override
         return key
-
-
-def _is_of_the_sweep(override: str) -> bool:
-    key = key_of(override)
-    return key in _OF_THE_SWEEP or key.startswith("sweep.")
 
 
 def _check_own(override: str) -> None:
@@ -237,9 +238,3 @@ def _check_own(override: str) -> None:
             override,
             "write the key itself, as in algorithm.lr='tag(log,interval(1e-5,1e-3))'; ~KEY removes one",
         )
-
-
-def _check_searched(key: str, override: str) -> None:
-    for refused, why in _NOT_SEARCHED.items():
-        if key == refused or key.startswith(f"{refused}."):
-            raise BadInput(override, f"cannot be searched: {why}")

@@ -50,10 +50,11 @@ def best_of(experiment: str, runs_dir: Path) -> Path:
             f"no such experiment in {runs_dir}{nearest(experiment, experiments)}; experiments there: "
             f"{', '.join(experiments[:10]) or 'none'}",
         )
-    results = {run: result for run in runs if (result := _result(run)) is not None}
+    with_best = [run for run in runs if (run / CHECKPOINTS / "best").is_dir()]
+    results = {run: result for run in with_best if (result := read_result(run)) is not None}
     results = {run: result for run, result in results.items() if result.evaluated} or results
     if not results:
-        if len(runs) == 1 and (runs[0] / CHECKPOINTS / "best").is_dir():
+        if len(runs) == 1 and with_best:
             return runs[0]
         raise BadInput(what, f"none of its {len(runs)} runs has a result and a checkpoint `best`; give a run")
     _check_comparable(what, results)
@@ -108,10 +109,6 @@ def best_run_of_sweep(folder: Path) -> Path | None:
     if run.resolve().parent != folder.resolve():
         raise BadInput(folder / BEST_OF_SWEEP, f"run {best.run_dir} is a link that leads out of {folder}")
     return run
-
-
-def _result(run: Path) -> RunResult | None:
-    return read_result(run) if (run / CHECKPOINTS / "best").is_dir() else None
 
 
 def _check_comparable(what: str, results: Mapping[Path, RunResult]) -> None:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from typing import Any
 
 from deepracer_exp.config.own_class import OwnClass, build_own
@@ -10,7 +11,6 @@ from deepracer_exp.config.stopping import (
     ConvergedRule,
     EntropyStopping,
     LapsSlowerRule,
-    NotLearningRule,
     PlateauStopping,
     ReliableStopping,
     StoppingConfig,
@@ -195,9 +195,10 @@ class TrendRule(StoppingRule):
         return _decision("plateau", why, values, config)
 
     def _entropy(self, config: EntropyStopping) -> Decision | None:
+        not_learning = partial(trends.not_learning, is_led=self._is_led)
         rules: tuple[tuple[str, Any, tuple[str, ...], Callable[..., Reason | None]], ...] = (
             ("collapsed", config.collapsed, ("entropy", "completion"), trends.collapsed),
-            ("not_learning", config.not_learning, ("entropy", "completion"), self._not_learning),
+            ("not_learning", config.not_learning, ("entropy", "completion"), not_learning),
             ("overfitting", config.overfitting, ("held_out_completion", "mean_return"), trends.overfits),
             ("laps_slower", config.laps_slower, (_LAP_SPEED, "mean_return"), self._laps_slower),
             ("converged", config.converged, _GROWTH, self._converged),
@@ -212,9 +213,6 @@ class TrendRule(StoppingRule):
             ):
                 return _decision(name, *reason, rule)
         return None
-
-    def _not_learning(self, rule: NotLearningRule, entropy: Average, completion: Average) -> Reason | None:
-        return trends.not_learning(rule, entropy, completion, is_led=self._is_led)
 
     def _laps_slower(self, rule: LapsSlowerRule, speed: Average, returns: Average) -> Reason | None:
         scores_s = self._race_scores_s

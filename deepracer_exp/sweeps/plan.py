@@ -37,7 +37,10 @@ def plan_sweep(overrides: Sequence[str], *, is_only_shown: bool = False) -> Swee
         BadInput: as for `compose_sweep`, `with_stored` and `plan_training`, or there is nothing to search.
     """
     request, study = compose_sweep(overrides), None
-    remarks = _check_shared(request)
+    # Files and options that all trials share; the values of the search are checked with its space, which needs Optuna.
+    shared = (*groups(), custom_files.KEY, "teacher", "runs_dir")
+    named = [line for line in request.base if (key := key_of(line)) in shared or key.endswith(".file")]
+    remarks = plan_training(*compose_experiment(named)).files.remarks
     if not (is_only_shown and request.space):
         from .queue.study import with_stored  # imports Optuna
 
@@ -45,13 +48,3 @@ def plan_sweep(overrides: Sequence[str], *, is_only_shown: bool = False) -> Swee
     if not is_only_shown:
         request.refuse_empty()
     return SweepPlan(request, overrides, study, remarks)
-
-
-def _check_shared(request: SweepRequest) -> tuple[str, ...]:
-    """Check the files and options that all trials share and return the remarks on their actions.
-
-    The values of the search are checked with the search space, which needs Optuna.
-    """
-    shared = (*groups(), custom_files.KEY, "teacher", "runs_dir")
-    named = [line for line in request.base if (key := key_of(line)) in shared or key.endswith(".file")]
-    return plan_training(*compose_experiment(named)).files.remarks

@@ -188,7 +188,7 @@ class ProgressDisplay:
             self._figure("speed").replace(" steps/s", "/s"),
             f"return {self._figure('return')}",
             f"completion {self._figure('completion')}",
-            self._evaluated_lap(),
+            f"usual lap {self._figure('usual lap')} ({self._figure(_COMPLETE)})",
             f"exploring laps {self._figure('exploring laps')} ({share} of last {self._header.remembered})",
             self._tracks.least() if self._tracks else f"their fastest {self._figure('their fastest')}",
             f"entropy {self._figure('entropy')}",
@@ -196,10 +196,6 @@ class ProgressDisplay:
             _left(self._eta_s),
         ]
         return " · ".join(parts)
-
-    def _evaluated_lap(self) -> str:
-        """Return the mean lap of the last evaluation on usual conditions, and how many of its laps were complete."""
-        return f"usual lap {self._figure('usual lap')} ({self._figure(_COMPLETE)})"
 
     def _panel(self) -> Panel:
         # On a wider terminal the halves would be too far apart to be read together.

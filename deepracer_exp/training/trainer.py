@@ -265,7 +265,10 @@ class Trainer:
                     collector.publish_rivals(self.rivals.driving)
 
                 # 5. Save when due and at the end.
-                if self.ending or self._save_requested or self._is_time_to_save():
+                is_due = (
+                    self.iteration % _LAST_EVERY == 0 or time.monotonic() > self._saved_at + _LAST_EVERY_S
+                )
+                if self.ending or self._save_requested or is_due:
                     self.save(collector, is_best)
         assert self.ending is not None
         hurry = any(callback.hurries_when_interrupted for callback in self.callbacks)
@@ -491,6 +494,3 @@ class Trainer:
             "env_steps_per_s": round(frames / (collect_s + update_s), 1),
             **self.metrics.row_of_tracks(finished),
         }
-
-    def _is_time_to_save(self) -> bool:
-        return self.iteration % _LAST_EVERY == 0 or time.monotonic() > self._saved_at + _LAST_EVERY_S

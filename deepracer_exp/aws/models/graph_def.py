@@ -62,7 +62,7 @@ def policy_graph(
     # First and in that order: OpenVINO 2024 on the car takes its shapes for the graph's inputs one after the other.
     for sensor, shape in sensors.items():
         placeholder = f"{INPUTS}/{sensor}/{sensor}"
-        graph.node(placeholder, "Placeholder", dtype=_type(_FLOAT), shape=_shape((-1, *shape)))
+        graph.node(placeholder, "Placeholder", dtype=_type(_FLOAT), shape=field(7, _dimensions((-1, *shape))))
     for sensor, shape in sensors.items():
         scope = f"{POLICY_NETWORK}/{sensor}"
         raw = f"{INPUTS}/{sensor}/{sensor}"
@@ -212,10 +212,6 @@ def _type(kind: int) -> bytes:
 
 def _dimensions(shape: Sequence[int]) -> bytes:
     return b"".join(field(2, field(1, size)) for size in shape)
-
-
-def _shape(shape: Sequence[int]) -> bytes:
-    return field(7, _dimensions(shape))
 
 
 def _integers(*values: int) -> bytes:

@@ -20,7 +20,7 @@ from typing import Any
 import sqlalchemy as sa
 from optuna.exceptions import UpdateFinishedTrialError
 from optuna.storages import BaseStorage
-from optuna.trial import FrozenTrial, TrialState
+from optuna.trial import TrialState
 from sqlalchemy.exc import DBAPIError, IntegrityError
 
 from deepracer_exp.sweeps.trial import SeedRun, Trial, as_runs, runs_as_json
@@ -342,16 +342,14 @@ def report_results(claims: TrialClaims, storage: BaseStorage) -> None:
             # Not by a method of `Study`, which ends the process's study with the last point of a grid.
             state, values = TrialState[trial.state], trial.values
             if state == TrialState.PRUNED:
-                values = _last_value(storage.get_trial(trial_id))
+                # Optuna records the last value of a pruned trial as its result.
+                pruned = storage.get_trial(trial_id)
+                step = pruned.last_step
+                values = None if step is None else [pruned.intermediate_values[step]]
             storage.set_trial_state_values(trial_id, state, values)
         except UpdateFinishedTrialError:
             pass  # another process was faster, with the same result
         claims.mark_reported(trial.number)
-
-
-def _last_value(trial: FrozenTrial) -> list[float] | None:
-    """Return the last value of a pruned trial, which Optuna records as its result."""
-    return None if trial.last_step is None else [trial.intermediate_values[trial.last_step]]
 
 
 def _runs(row: sa.Row[Any]) -> tuple[SeedRun, ...]:

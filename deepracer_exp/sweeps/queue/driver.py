@@ -94,7 +94,9 @@ class Driver:
         for worker in [worker for worker in self._running if worker.exitcode is not None]:
             self._running.remove(worker)
             # A reward function can end its process with 0, too.
-            if worker.exitcode == 0 and patiently(self._is_done, self._config.config.patience_s):
+            if worker.exitcode == 0 and patiently(
+                lambda: self._claims.is_done(self._config.config.trials), self._config.config.patience_s
+            ):
                 self._all_made = True
                 continue
             if worker.owner is not None and worker.is_seen:
@@ -123,9 +125,6 @@ class Driver:
             lambda: self._claims.release(owner, is_lost=is_lost),
             patience_s or self._config.config.patience_s,
         )
-
-    def _is_done(self) -> bool:
-        return self._claims.is_done(self._config.config.trials)
 
     def _look(self) -> list[Claim]:
         claims = patiently(self._claims.all, self._config.config.patience_s)

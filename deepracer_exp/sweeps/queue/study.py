@@ -62,11 +62,6 @@ def load_study(name: str, storage: RDBStorage) -> Study:
     return study
 
 
-def _names_only(overrides: Sequence[str]) -> bool:
-    """Return whether overrides leave the trials as they are, so that they name a study to resume."""
-    return not {override.partition("=")[0].strip().lstrip("+~") for override in overrides} - {*MAY_DIFFER}
-
-
 def with_stored(
     request: SweepRequest, overrides: Sequence[str]
 ) -> tuple[Sequence[str], SweepRequest, Study | None]:
@@ -77,7 +72,7 @@ def with_stored(
     Raises:
         BadInput: an override is not accepted, there is nothing to search, or there is no study of that name to resume.
     """
-    names_only = _names_only(overrides)
+    names_only = not set(map(key_of, overrides)) - {*MAY_DIFFER}
     study = _existing(request, names_only)
     if study is None:
         return overrides, request, None

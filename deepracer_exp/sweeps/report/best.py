@@ -9,7 +9,7 @@ import numpy as np
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
-from deepracer_exp.analysis.evidence import Interval, difference, estimate
+from deepracer_exp.analysis.evidence import difference, estimate
 from deepracer_exp.analysis.statistics import Values
 from deepracer_exp.errors import BadInput
 from deepracer_exp.lookup.best import BestOfSweep, write_best_of_sweep
@@ -142,7 +142,7 @@ def over_seeds(study: optuna.Study, keys: dict[str, str]) -> list[dict[str, Any]
             "trial": trial.number,
             "seeds": score.seeds,
             "iqm": shown(objective, score.iqm),
-            "interval": _ends(objective, score.interval),
+            "interval": " to ".join(shown(objective, end) for end in score.interval or ()) or NONE,
             "difference": NONE,
             "probability": NONE,
             "verdict": "the best" if trial.number == best.number else NONE,
@@ -161,7 +161,3 @@ def over_seeds(study: optuna.Study, keys: dict[str, str]) -> list[dict[str, Any]
 
 def _values(trial: FrozenTrial) -> Values:
     return np.array([run.values[0] for run in Trial.of(trial).runs if run.values], np.float64)
-
-
-def _ends(objective: str, interval: Interval | None) -> str:
-    return NONE if interval is None else " to ".join(shown(objective, end) for end in interval)
