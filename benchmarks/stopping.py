@@ -42,7 +42,7 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.stopping import StoppingConfig
 from deepracer_exp.runs.checkpoints import checkpoint_name, read_training
 from deepracer_exp.runs.files import read_record
-from deepracer_exp.stopping.replay import replay
+from deepracer_exp.stopping.backtest import backtest
 from deepracer_exp.training.metrics import NOT_EVALUATED
 
 from .command import at_once, read_metrics, read_summary, trained
@@ -106,7 +106,7 @@ def prove(full: Path, stopped: Path, iteration: int, kept: str) -> dict[str, Any
 def measure(run: Path, rule: StoppingConfig, trials: int = TRIALS) -> dict[str, Any]:
     """Apply the rule to a full run and let both checkpoints drive."""
     record = read_record(run)
-    end = replay(record, rule, RULE)
+    end = backtest(record, rule, RULE)
     # A run that ends is raced once more: the best of the full run may be its last policy.
     best = (run / "checkpoints" / "best").resolve().name
     kept = best if end.iteration == end.iterations else best_within(run, end.iteration)

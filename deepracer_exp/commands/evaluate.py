@@ -310,14 +310,14 @@ def _replay(args: argparse.Namespace) -> int:
         overrides.insert(0, "stopping=entropy")
     records = [read_record(stores.find(run).path) for run in runs]
 
-    from deepracer_exp.stopping.replay import replay, table
+    from deepracer_exp.stopping.backtest import backtest, table
 
     rules = [
         (" ".join(map(_within_group, lines)), compose_experiment(lines)[0])
         for lines in expand_grid(overrides)
     ]
-    replays = [replay(record, config.stopping, rule) for record in records for rule, config in rules]
-    table_console().print(table(replays))
+    backtests = [backtest(record, config.stopping, rule) for record in records for rule, config in rules]
+    table_console().print(table(backtests))
     return 0
 
 

@@ -16,7 +16,7 @@ from deepracer_exp.env.setup import build_courses
 from deepracer_exp.reports.run_page import write_pictures
 from deepracer_exp.runs.files import read_record
 from deepracer_exp.runs.recording import read_run_recording
-from deepracer_exp.stopping.replay import replay
+from deepracer_exp.stopping.backtest import backtest
 from tests.waiting import wait_until
 
 NOT_LEARNING = (
@@ -41,7 +41,7 @@ def test_a_run_that_does_not_learn_is_stopped_early(trained):
 
 def test_the_replay_of_a_run_comes_to_the_runs_own_decision(trained, call):
     ended = trained(*NOT_LEARNING)
-    found = replay(read_record(ended.folder), compose_experiment(NOT_LEARNING)[0].stopping, "")
+    found = backtest(read_record(ended.folder), compose_experiment(NOT_LEARNING)[0].stopping, "")
     assert found.iteration == ended.summary["iteration"]
     assert found.decision.as_dict() == ended.summary["stopping"]
     assert found.saved_steps == 0

@@ -1,4 +1,4 @@
-"""Replays of a stopping rule: the iteration at which it would have ended runs that continued."""
+"""Backtests of stopping rules: the iteration at which a rule would have ended runs that continued."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ _NOTHING = "\N{EN DASH}"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Replay:
+class Backtest:
     """A run and where a stopping rule would have ended it."""
 
     run: str
@@ -58,7 +58,7 @@ class Replay:
         return self.lap_time_s / self.lap_time_whole_s - 1
 
 
-def replay(record: RunRecord, config: StoppingConfig, rule: str) -> Replay:
+def backtest(record: RunRecord, config: StoppingConfig, rule: str) -> Backtest:
     """Apply a stopping rule to the metrics of a run.
 
     Raises:
@@ -77,7 +77,7 @@ def replay(record: RunRecord, config: StoppingConfig, rule: str) -> Replay:
             count = number
             break
     last, end = rows[-1], rows[count - 1]
-    return Replay(
+    return Backtest(
         run=record.name,
         rule=rule,
         decision=decision,
@@ -94,30 +94,30 @@ def replay(record: RunRecord, config: StoppingConfig, rule: str) -> Replay:
     )
 
 
-def table(replays: Sequence[Replay]) -> Table:
-    """Return the replays as a table, a line a run and rule, and for several runs the means of each rule."""
+def table(backtests: Sequence[Backtest]) -> Table:
+    """Return the backtests as a table, a line a run and rule, and for several runs the means of each rule."""
     grid = Table(box=None, pad_edge=False, header_style="bold")
     for name in ("run", "rule"):
         grid.add_column(name, overflow="fold")
     for name in ("ends after", "steps", "saved", "completion", "fastest lap", "lap lost"):
         grid.add_column(name, justify="right", no_wrap=True)
-    for replayed in replays:
+    for tested in backtests:
         grid.add_row(
-            replayed.run,
-            f"{replayed.rule}\n{replayed.decision or 'continues to the end'}",
-            f"{replayed.iteration} of {replayed.iterations}",
-            f"{replayed.env_steps:,}",
-            f"{replayed.saved:.0%}, {replayed.saved_s:.0f} s" if replayed.decision else _NOTHING,
-            _of(replayed.completion, replayed.completion_whole, "{:.1f}", "%"),
-            _of(replayed.lap_time_s, replayed.lap_time_whole_s, "{:.2f}", "s")
-            + " exploring" * (not replayed.evaluated),
-            _NOTHING if replayed.lap_loss is None else f"{replayed.lap_loss:.1%}",
+            tested.run,
+            f"{tested.rule}\n{tested.decision or 'continues to the end'}",
+            f"{tested.iteration} of {tested.iterations}",
+            f"{tested.env_steps:,}",
+            f"{tested.saved:.0%}, {tested.saved_s:.0f} s" if tested.decision else _NOTHING,
+            _of(tested.completion, tested.completion_whole, "{:.1f}", "%"),
+            _of(tested.lap_time_s, tested.lap_time_whole_s, "{:.2f}", "s")
+            + " exploring" * (not tested.evaluated),
+            _NOTHING if tested.lap_loss is None else f"{tested.lap_loss:.1%}",
         )
-    for rule in dict.fromkeys(replayed.rule for replayed in replays):
-        of_rule = [replayed for replayed in replays if replayed.rule == rule]
-        losses = [replayed.lap_loss for replayed in of_rule if replayed.lap_loss is not None]
+    for rule in dict.fromkeys(tested.rule for tested in backtests):
+        of_rule = [tested for tested in backtests if tested.rule == rule]
+        losses = [tested.lap_loss for tested in of_rule if tested.lap_loss is not None]
         if len(of_rule) > 1:
-            saved = f"{sum(replayed.saved for replayed in of_rule) / len(of_rule):.0%}"
+            saved = f"{sum(tested.saved for tested in of_rule) / len(of_rule):.0%}"
             lost = f"{sum(losses) / len(losses):.1%}" if losses else _NOTHING
             grid.add_row("mean", rule, "", "", saved, "", "", lost)
     return grid

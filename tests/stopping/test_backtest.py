@@ -7,7 +7,7 @@ import pytest
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.files import read_record
-from deepracer_exp.stopping.replay import Replay, replay
+from deepracer_exp.stopping.backtest import Backtest, backtest
 
 LENGTH = 200
 LEARNED_AT = 30
@@ -45,8 +45,8 @@ def make_run(tmp_path: Path) -> Callable[..., Path]:
     return make
 
 
-def replayed(folder: Path, *overrides: str) -> Replay:
-    return replay(read_record(folder), compose_experiment(overrides)[0].stopping, " ".join(overrides))
+def replayed(folder: Path, *overrides: str) -> Backtest:
+    return backtest(read_record(folder), compose_experiment(overrides)[0].stopping, " ".join(overrides))
 
 
 def test_it_reports_where_the_run_would_have_ended_and_what_that_saves_and_loses(make_run):
