@@ -79,7 +79,7 @@ def read_recorded(paths: Sequence[Path]) -> list[Recorded]:
         for problem in recording.problems:
             print(problem, file=sys.stderr)
         name, metadata = path.resolve().name, recording.metadata
-        stated = metadata is not None and "version" in metadata.given and metadata.version in VERSIONS
+        stated = metadata is not None and "version" in metadata.set_keys and metadata.version in VERSIONS
         streams = list(recording.steps.groupby("stream", sort=False, observed=True))
         for stream, steps in streams:
             windows = {

@@ -59,8 +59,8 @@ def redact(text: str) -> str:
     return _PARAMETER.sub("", _USER_INFO.sub("***@", text))
 
 
-def _without_password(found: re.Match[str]) -> str:
-    scheme, rest = found.groups()
+def _without_password(match: re.Match[str]) -> str:
+    scheme, rest = match.groups()
     # Quotes and brackets of the shell or of Hydra's grammar are not part of the address.
     address = rest.rstrip("'\"]},")
     around = rest[len(address) :]

@@ -39,12 +39,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
             reward functions does so in a child process.
     """
     args = argparse.Namespace()
-    given = without_passwords(list(sys.argv[1:] if arguments is None else arguments))
+    words = without_passwords(list(sys.argv[1:] if arguments is None else arguments))
     if arguments is None:
         guard_imports()
-        sys.argv[1:] = given  # the run's folder keeps them
+        sys.argv[1:] = words  # the run's folder keeps them
     try:
-        args = parse(given)
+        args = parse(words)
     except BadInput as error:
         sys.exit(_fail(error, BadInput.exit_code, args))
     if arguments is None:

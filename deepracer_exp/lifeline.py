@@ -34,8 +34,8 @@ def guard_imports() -> None:
 
 def given_environment() -> dict[str, str]:
     """Return the environment without what `guard_imports` has set, for a program of the user's own."""
-    given = {} if _GIVEN_SAFE_PATH is None else {_SAFE_PATH: _GIVEN_SAFE_PATH}
-    return {name: value for name, value in os.environ.items() if name != _SAFE_PATH} | given
+    variables = {} if _GIVEN_SAFE_PATH is None else {_SAFE_PATH: _GIVEN_SAFE_PATH}
+    return {name: value for name, value in os.environ.items() if name != _SAFE_PATH} | variables
 
 
 def kill_when_closed(pipe: int, target: int) -> None:

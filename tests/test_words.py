@@ -11,11 +11,15 @@ PRODUCT = Path(__file__).parents[1] / "deepracer_exp"
 VAGUE = {"one", "found", "at", "known", "own", "given", "asked", "told", "heard"}
 NAMED = (
     "agents",
+    "analysis",
+    "aws",
     "collectors",
     "commands",
     "config",
     "env",
     "evaluation",
+    "export",
+    "fastest",
     "lookup",
     "rewards",
     "runs",
@@ -23,6 +27,7 @@ NAMED = (
     "stopping",
     "sweeps",
     "tracking",
+    "tracks",
     "training",
 )
 """Packages whose names all say what they hold."""

@@ -131,18 +131,18 @@ class Difference:
         )
 
 
-def difference(one: Strata, other: Strata, lower_is_better: bool) -> Difference:
-    """Return how `one` differs from `other`; both have the same tracks in the same order.
+def difference(scores: Strata, other: Strata, lower_is_better: bool) -> Difference:
+    """Return how `scores` differ from those of the `other` group; both have the same tracks in the same order.
 
     Raises:
         ValueError: a track has no score.
     """
     cells = [
-        (tuple(np.sort(values)), tuple(np.sort(others))) for values, others in zip(one, other, strict=True)
+        (tuple(np.sort(values)), tuple(np.sort(others))) for values, others in zip(scores, other, strict=True)
     ]
     pairs, turned = sorted(cells), sorted(cell[::-1] for cell in cells)
     if turned < pairs:  # which group is named first decides nothing but signs
-        return difference(other, one, lower_is_better).reversed()
+        return difference(other, scores, lower_is_better).reversed()
     ours, theirs = ([np.array(cell) for cell in side] for side in zip(*pairs, strict=True))
     both, rng = [*ours, *theirs], np.random.default_rng(0)
     varies = _freedom(both) >= LEAST_FOR_INTERVAL - 1

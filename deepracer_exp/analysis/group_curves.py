@@ -33,7 +33,7 @@ def group_curve(group: RunGroup, column: str) -> pd.DataFrame:
         Columns `env_steps`, `iqm`, `low`, `high` (NaN where unknown, infinite where more than a quarter of the runs has
         no lap) and `runs`, the number of runs with a value; no row where no run has one.
     """
-    curves = [_known(record, column) for record in group.records]
+    curves = [_measured(record, column) for record in group.records]
     steps = np.unique(np.concatenate([own_steps for own_steps, _ in curves]))
     if not len(steps):
         return pd.DataFrame(columns=["env_steps", "iqm", "low", "high", "runs"])
@@ -46,7 +46,7 @@ def group_curve(group: RunGroup, column: str) -> pd.DataFrame:
     )
 
 
-def _known(record: RunRecord, column: str) -> tuple[Values, Values]:
+def _measured(record: RunRecord, column: str) -> tuple[Values, Values]:
     """Return the steps at which a run has a value of a column, and the values."""
     rows = pd.DataFrame(record.rows)
     if column.startswith("eval_"):

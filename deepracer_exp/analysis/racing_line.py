@@ -45,7 +45,7 @@ class Line:
         """Return the speed that needs `lateral_mps2` of lateral acceleration, at most `top_mps`, braking ignored."""
         return np.minimum(top_mps, np.sqrt(lateral_mps2 / np.maximum(np.abs(self.curvature_pm), 1e-9)))
 
-    def at(self, lap_position: Values, values: Values) -> Values:
+    def interpolate(self, lap_position: Values, values: Values) -> Values:
         """Return `values` of the line's points, interpolated at other places."""
         return np.interp(lap_position, self.lap_position, values)
 

@@ -138,7 +138,7 @@ class CustomFiles:
     @property
     def car(self) -> str | None:
         """Return the option of the car of the model's simulation version; None if the version is not given."""
-        if self.metadata is None or "version" not in self.metadata.given:
+        if self.metadata is None or "version" not in self.metadata.set_keys:
             return None
         return CARS.get(self.metadata.version)
 
@@ -164,7 +164,7 @@ class CustomFiles:
         return {
             key: getattr(settings, key)
             for key in self.taken
-            if key != "term_cond_max_episodes" or key in settings.given
+            if key != "term_cond_max_episodes" or key in settings.set_keys
         }
 
     def remarks(self, besides: Sequence[str] = ()) -> list[str]:
@@ -182,17 +182,17 @@ class CustomFiles:
             "neural_network": metadata.neural_network,
             "version": metadata.version,
         }
-        for key in metadata.given:
+        for key in metadata.set_keys:
             if key in NOT_APPLICABLE and key not in besides and not (key == "version" and self.car):
                 shown = f"{key}={values[key]}" if key in values else key
                 same = [" ".join(sensor_overrides(metadata))] if key == "sensor" else []
                 yield shown, " ".join([f"not applicable: {NOT_APPLICABLE[key]}", *same])
         if metadata.renumbered:
             yield "action_space: index", "ignored: an action's number is its position, as in the service"
-        yield from _unknown(metadata.given, model_metadata.KEYS)
+        yield from _unknown(metadata.set_keys, model_metadata.KEYS)
 
     def _learning_remarks(self, settings: Hyperparameters) -> Iterable[tuple[str, str]]:
-        missing = [f"{key}={value}" for key, value in self.learning.items() if key not in settings.given]
+        missing = [f"{key}={value}" for key, value in self.learning.items() if key not in settings.set_keys]
         if missing:
             yield ", ".join(missing), "missing in the file; the service's default is used"
         for key in settings.beyond_console():
@@ -202,10 +202,10 @@ class CustomFiles:
                 f"exploration_type={settings.exploration_type}",
                 "not applicable: here actions are drawn from the policy (categorical, of SAC additive_noise)",
             )
-        for key in settings.given:
+        for key in settings.set_keys:
             if key in NOT_APPLICABLE and key not in self.taken:
                 yield f"{key}={getattr(settings, key)}", f"not applicable: {NOT_APPLICABLE[key]}"
-        yield from _unknown(settings.given, hyperparameters.KEYS)
+        yield from _unknown(settings.set_keys, hyperparameters.KEYS)
 
 
 def sensor_overrides(metadata: ModelMetadata) -> list[str]:

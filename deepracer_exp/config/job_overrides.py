@@ -134,7 +134,7 @@ def _remarks(workers: Sequence[JobSettings]) -> Iterator[tuple[str, str]]:
         yield first.name, f"{first.keys['PRETRAINED']}=True: not applied: {fresh}"
     read = {*first.keys.values(), *FILE_KEYS.values(), "TRACK_DIRECTION_CLOCKWISE"}
     unused: dict[str, list[str]] = {}
-    for key in dict.fromkeys(key for worker in workers for key in worker.given if key not in read):
+    for key in dict.fromkeys(key for worker in workers for key in worker.set_keys if key not in read):
         why = next(why for pattern, why in _NOT_APPLICABLE.items() if re.match(pattern, key))
         unused.setdefault(why, []).append(key)
     for why, keys in unused.items():

@@ -30,7 +30,8 @@ def export_files(run: StoredRun, _: str, folder: Path) -> Written:
     texts, notes = aws_files(run.experiment, reward)
     write_files(texts, folder)
     refused = [
-        f"reward_function.py: deepracer-on-aws would refuse it: {one}" for one in text_findings(reward)
+        f"reward_function.py: deepracer-on-aws would refuse it: {finding}"
+        for finding in text_findings(reward)
     ]
     return (folder / name for name in texts), notes + refused
 
@@ -83,11 +84,11 @@ def sensor_keys(observation: ObservationConfig) -> dict[str, Any]:
 def hyperparameters_of(experiment: Experiment) -> Hyperparameters:
     """Return an experiment's hyperparameters in the service's terms, with the service's default where it has none."""
     is_sac = isinstance(experiment.algorithm, SACConfig)
-    own: dict[str, Any] = {"exploration_type": "additive_noise"} if is_sac else {}
+    values: dict[str, Any] = {"exploration_type": "additive_noise"} if is_sac else {}
     for key, target in (SAC_TAKEN if is_sac else TAKEN).items():
         group, name = target.split(".")
-        own[key] = getattr(getattr(experiment, group), name)
-    return replace(Hyperparameters(), **{key: value for key, value in own.items() if value is not None})
+        values[key] = getattr(getattr(experiment, group), name)
+    return replace(Hyperparameters(), **{key: value for key, value in values.items() if value is not None})
 
 
 def _hyperparameters(experiment: Experiment) -> tuple[Hyperparameters, list[str]]:

@@ -104,8 +104,8 @@ def _number(steps: pd.DataFrame, period_s: float) -> NumberedTraining:
     trial[np.flatnonzero(iteration == 0)[-1]] = per_iteration
     episodes = episodes.assign(number=iteration * per_iteration + trial - 1, trial=trial, iteration=iteration)
     finished = rows[rows["episode"].isin(episodes.index)]
-    own = episodes.loc[finished["episode"]]
-    finished = finished.assign(number=own["number"].array, trace_iteration=own["iteration"].array)
+    matching = episodes.loc[finished["episode"]]
+    finished = finished.assign(number=matching["number"].array, trace_iteration=matching["iteration"].array)
     return NumberedTraining(
         rows=finished.sort_values("number", kind="stable"),
         episodes=episodes,

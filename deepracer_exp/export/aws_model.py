@@ -109,19 +109,19 @@ def services_kind(experiment: Experiment, metadata: ModelMetadata) -> str:
     """
     network = experiment.network
     assert isinstance(network, CNNConfig)
-    own = {
+    layers = {
         key: getattr(network, key) for key in _LAYERS if key != "lidar_hidden" or experiment.observation.lidar
     }
     options = []
     for kind in NEURAL_NETWORKS:
         option, values = services_network(replace(metadata, neural_network=kind))
         services = vars(compose_option("network", option, CNNConfig)) | values
-        if all(list(value) == list(services[key]) for key, value in own.items()):
+        if all(list(value) == list(services[key]) for key, value in layers.items()):
             return kind
         options.append(
             f"network={option}" + "".join(f" network.{key}={value}" for key, value in values.items())
         )
-    shown = ", ".join(f"{key}={list(value)}" for key, value in own.items())
+    shown = ", ".join(f"{key}={list(value)}" for key, value in layers.items())
     raise BadInput("network", f"{shown}: the service builds no such network", "; or ".join(options))
 
 

@@ -108,7 +108,7 @@ class Question:
     def key(self) -> str:
         """Return a hash of track, car, limits and algorithm."""
         track = self.track
-        asked = {
+        question = {
             "algorithm": ALGORITHM,
             "car": asdict(self.experiment.car),
             "low": self.low.tolist(),
@@ -116,7 +116,7 @@ class Question:
             "closed": track.closed,
             "friction": track.floor.friction,
         }
-        digest = hashlib.sha256(json.dumps(asked, sort_keys=True).encode())
+        digest = hashlib.sha256(json.dumps(question, sort_keys=True).encode())
         for line in (track.waypoints, track.inner, track.outer):
             digest.update(np.ascontiguousarray(line, np.float64).tobytes())
         return digest.hexdigest()[:32]

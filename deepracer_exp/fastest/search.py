@@ -152,7 +152,7 @@ class Search:
                 self._improved(state, np.concatenate([plan, tail]), begin_m, length_m - begin_m, _AHEAD)
                 for tail in tails
             ]
-            planned = min(plans, key=lambda one: one.score)
+            planned = min(plans, key=lambda plan: plan.score)
             plan = planned.commands
             if planned.complete:
                 return np.concatenate([*commands, plan])
@@ -241,7 +241,7 @@ class Search:
             gained = plan.score < (*best.score[:-1], best.score[-1] - _GAIN_M)
             # Off the road there is nothing to be content with.
             since = 0 if gained or not best.on_road else since + 1
-            best = min(best, plan, key=lambda one: one.score)
+            best = min(best, plan, key=lambda plan: plan.score)
             if plan.complete:  # now in fewer periods
                 states, commands, pull = (
                     states[: end + 1].copy(),

@@ -368,7 +368,7 @@ def _drive(  # type: ignore[no-untyped-def]
     changing = math.isfinite(least_after_s)
     for place in range(len(ids)):
         car, track, now_s = ids[place], track_index[place], time_s[place]
-        length_m, first, cells = paths.length_m[track], paths.at[track], paths.cells[track]
+        length_m, first, cells = paths.length_m[track], paths.first_row[track], paths.cells[track]
         driven_m = speed_mps * max(now_s - pauses[car] * pause_s, 0.0)
         for bot in range(start_m.shape[1]):
             if changing and now_s >= change_end_s[car, bot]:

@@ -24,13 +24,13 @@ Floats = NDArray[np.float64]
 class Paths(NamedTuple):
     """The paths of bots along both lanes of one or more courses, sampled for look-up (arrays for compiled code).
 
-    Course w has `cells[w]` cells; their ends are rows `at[w]` to `at[w] + cells[w]` of each lane.
+    Course w has `cells[w]` cells; their ends are rows `first_row[w]` to `first_row[w] + cells[w]` of each lane.
     """
 
     rows: Floats
     """(2, R, 6): x and y in metres, their derivatives by the distance along the centre line, the distance of the
     projection on the centre line less the distance itself, and the offset to the left of it, in metres."""
-    at: NDArray[np.int64]
+    first_row: NDArray[np.int64]
     cells: NDArray[np.int64]
     length_m: Floats
     """Length of each course's centre line, in metres."""

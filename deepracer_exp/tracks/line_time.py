@@ -66,7 +66,7 @@ def fastest_line(
     lines = road.simple_lines() if driven is None else [road.offsets_of(driven)]
     # Improving takes long; the two most promising lines are worth it.
     promising = sorted(lines, key=road.time_s)[:2]
-    improved = min((road.improved(offsets) for offsets in promising), key=lambda one: one[0])
+    improved = min((road.improved(offsets) for offsets in promising), key=lambda line: line[0])
     return improved[0], road.line(improved[1])
 
 
@@ -85,8 +85,8 @@ class _Road:
         wanted_m = ((start_ndist or 0.0) + shares) * track.length_m
         if track.closed:
             wanted_m = np.mod(wanted_m, track.length_m)
-        at = np.interp(wanted_m, place_m, np.arange(len(place_m)))
-        inner, outer = (_between(line, at) for line in (track.inner, track.outer))
+        places = np.interp(wanted_m, place_m, np.arange(len(place_m)))
+        inner, outer = (_between(line, places) for line in (track.inner, track.outer))
         self._middle, self._half = 0.5 * (outer + inner), 0.5 * (outer - inner)
         self._reach = 1.0 + reach_m / np.maximum(np.hypot(*self._half.T), 1e-6)
         self._start = None if start_ndist is None else track.points_at(np.array([start_ndist]))[0]
@@ -116,13 +116,13 @@ class _Road:
 
     def improved(self, offsets: Floats) -> tuple[float, Floats]:
         """Return the least time on a line near by, and its offsets."""
-        found = minimize(
+        result = minimize(
             lambda moved: self.time_s(offsets + self._basis @ moved),
             np.zeros(len(self._knots)),
             method="L-BFGS-B",
             options={"eps": 1e-4, "maxiter": _ITERATIONS, "maxfun": 10**6},
         )
-        return float(found.fun), offsets + self._basis @ found.x
+        return float(result.fun), offsets + self._basis @ result.x
 
     def offsets_of(self, driven: Floats) -> Floats:
         """Return the offsets of a driven line, (n, 2), at the gates."""
@@ -154,8 +154,8 @@ class _Road:
         return lines
 
 
-def _between(line: Floats, at: Floats) -> Floats:
-    return np.stack([np.interp(at, np.arange(len(line)), line[:, axis]) for axis in (0, 1)], axis=1)
+def _between(line: Floats, places: Floats) -> Floats:
+    return np.stack([np.interp(places, np.arange(len(line)), line[:, axis]) for axis in (0, 1)], axis=1)
 
 
 def _both(matrix: csr_array) -> csr_array:

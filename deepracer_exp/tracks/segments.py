@@ -52,7 +52,7 @@ class Segments(NamedTuple):
     """Index of each vertex among the line's points; of repeated points, the first."""
     points: np.ndarray
     """Number of points of each line, repeats included."""
-    at: np.ndarray
+    first_row: np.ndarray
     segments: np.ndarray
     total_m: np.ndarray
     bucket: np.ndarray
@@ -107,7 +107,7 @@ def build_segments(vertices: np.ndarray) -> Segments:
         heading_rad=np.r_[np.arctan2(dy, dx), beyond],
         point=point,
         points=np.array([len(vertices)]),
-        at=np.array([0]),
+        first_row=np.array([0]),
         segments=np.array([len(length_m)]),
         total_m=start_m[-1:],
         bucket=bucket,
@@ -127,7 +127,7 @@ def build_segments(vertices: np.ndarray) -> Segments:
 def join_segments(lines: Sequence[Segments]) -> Segments:
     """Join polylines in their order."""
     moved = {
-        "at": "x",
+        "first_row": "x",
         "bucket": "x",
         "bucket_at": "bucket",
         "cell_at": "first",
@@ -140,13 +140,13 @@ def join_segments(lines: Sequence[Segments]) -> Segments:
 class Bands(NamedTuple):
     """The edges of one or more polygons, sorted by y band.
 
-    Band k of polygon w has the rows `first[b]:first[b + 1]` of `edge` with b = `at[w] + k`.
+    Band k of polygon w has the rows `first[b]:first[b + 1]` of `edge` with b = `first_row[w] + k`.
     """
 
     low_y: np.ndarray
     band_m: np.ndarray
     bands: np.ndarray
-    at: np.ndarray
+    first_row: np.ndarray
     first: np.ndarray
     edge: np.ndarray
     """(entries, 4): lower y, upper y, x at the lower end, dx / dy."""
@@ -186,7 +186,7 @@ def build_bands(road: BaseGeometry) -> Bands:
         low_y=np.array([low_y]),
         band_m=np.array([band_m]),
         bands=np.array([bands]),
-        at=np.array([0]),
+        first_row=np.array([0]),
         first=first,
         edge=np.ascontiguousarray(edges[index]),
     )
@@ -194,7 +194,7 @@ def build_bands(road: BaseGeometry) -> Bands:
 
 def join_bands(roads: Sequence[Bands]) -> Bands:
     """Join polygons in their order."""
-    return _joined(roads, {"at": "first", "first": "edge"})
+    return _joined(roads, {"first_row": "first", "first": "edge"})
 
 
 def _joined(parts: Sequence[Any], moved: Mapping[str, str]) -> Any:
@@ -263,7 +263,7 @@ def nearest_segment(s, line, px, py):  # type: ignore[no-untyped-def]
     """Return the row of the line's segment nearest to (px, py) and the fraction along it (nan for a nan point)."""
     column = (px - s.low_x[line]) / s.cell_m[line]
     row = (py - s.low_y[line]) / s.cell_m[line]
-    best, nearest, fraction = np.inf, s.at[line], np.nan
+    best, nearest, fraction = np.inf, s.first_row[line], np.nan
     if 0.0 <= column < s.columns[line] and 0.0 <= row < s.rows[line]:
         cell = s.cell_at[line] + int(row) * s.columns[line] + int(column)
         for k in range(s.first[cell], s.first[cell + 1]):
@@ -272,7 +272,7 @@ def nearest_segment(s, line, px, py):  # type: ignore[no-untyped-def]
             if d < best:
                 best, nearest, fraction = d, index, f
     else:
-        for index in range(s.at[line], s.at[line] + s.segments[line]):
+        for index in range(s.first_row[line], s.first_row[line] + s.segments[line]):
             d, f = squared_distance(s.x, s.y, index, px, py)
             if d < best:
                 best, nearest, fraction = d, index, f
@@ -297,7 +297,7 @@ def project(s, track_index, points):  # type: ignore[no-untyped-def]
     center, heading_rad = np.empty((count, 2)), np.empty(count)
     for i in range(count):
         line = track_index[i * len(track_index) // count]
-        begin, end = s.at[line], s.at[line] + s.segments[line] + 1
+        begin, end = s.first_row[line], s.first_row[line] + s.segments[line] + 1
         px, py = points[i, 0], points[i, 1]
         index, fraction = nearest_segment(s, line, px, py)
         x, y = along(s, index, fraction)
@@ -345,7 +345,7 @@ def poses_at(s, closed, track_index, ndist):  # type: ignore[no-untyped-def]
     x, y, heading_rad = np.empty(count), np.empty(count), np.empty(count)
     for i in range(count):
         line = track_index[i * len(track_index) // count]
-        begin, last = s.at[line], s.at[line] + s.segments[line] - 1
+        begin, last = s.first_row[line], s.first_row[line] + s.segments[line] - 1
         share = ndist[i] - math.floor(ndist[i]) if closed[line] else min(max(ndist[i], 0.0), 1.0)
         if math.isfinite(share):
             buckets = s.buckets[line]
@@ -375,7 +375,7 @@ def on_road(b, track_index, points):  # type: ignore[no-untyped-def]
         band = (py - b.low_y[road]) / b.band_m[road]
         # The top edge can round into the band above the last; nan falls through both comparisons.
         if 0.0 <= band < b.bands[road] + 1:
-            k = b.at[road] + min(int(band), b.bands[road] - 1)
+            k = b.first_row[road] + min(int(band), b.bands[road] - 1)
             odd = False
             for j in range(b.first[k], b.first[k + 1]):
                 if (

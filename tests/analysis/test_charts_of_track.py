@@ -202,7 +202,7 @@ def test_a_car_on_the_centre_line_is_away_from_the_racing_line_by_the_lines_own_
     assert layers(sector_times(view), "bars")[0].name == "median of 1 complete lap"
     median = next(one.y for one in layers(chart.rows[1][0], "line") if one.name == "median")
     line = minimum_curvature_line(view.course)
-    expected = -line.at(np.linspace(0.0, 1.0, 1000), line.offset_m)
+    expected = -line.interpolate(np.linspace(0.0, 1.0, 1000), line.offset_m)
     assert (median.min(), median.max()) == pytest.approx((expected.min(), expected.max()), abs=0.02)
 
 
@@ -213,7 +213,7 @@ def test_the_racing_line_bends_less_than_the_centre_line_and_keeps_to_the_road(n
     assert np.square(line.curvature_pm).mean() <= np.square(center.curvature_pm).mean() + 1e-12
     assert (np.abs(line.offset_m) <= course.width_max_m / 2 - MARGIN_M + 1e-6).all()
     places = np.linspace(0.01, 0.99, 500)
-    assert course.on_road(np.column_stack([line.at(places, axis) for axis in line.xy.T])).all()
+    assert course.on_road(np.column_stack([line.interpolate(places, axis) for axis in line.xy.T])).all()
 
 
 def test_a_circle_is_steered_at_the_angle_of_its_radius() -> None:

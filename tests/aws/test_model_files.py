@@ -49,13 +49,13 @@ def test_every_key_of_deepracer_for_clouds_file_is_read(tmp_path):
     found = hyperparameters(tmp_path, {"momentum": [0.9], **DRFC})
     assert set(DRFC) == set(KEYS)
     assert {key: getattr(found, key) for key in KEYS} == DRFC
-    assert found.given == ("momentum", *DRFC)
+    assert found.set_keys == ("momentum", *DRFC)
     assert found.beyond_console() == ()
 
 
 def test_a_missing_hyperparameter_has_the_services_default(tmp_path):
     found = hyperparameters(tmp_path, {"lr": 1e-4})
-    assert found == Hyperparameters(lr=1e-4, given=("lr",))
+    assert found == Hyperparameters(lr=1e-4, set_keys=("lr",))
     assert (found.batch_size, found.num_epochs, found.discount_factor) == (64, 10, 0.999)
     assert (found.loss_type, found.num_episodes_between_training) == ("mean squared error", 20)
 
@@ -111,7 +111,7 @@ def test_a_file_with_actions_only_gets_every_default(tmp_path):
         actions=(Action(-30.0, 0.6), Action(30.0, 1.2)), sensor=("observation",), version=1
     )
     found = metadata(tmp_path, action_space=DISCRETE)
-    assert (found, found.given) == (wanted, ("action_space",))
+    assert (found, found.set_keys) == (wanted, ("action_space",))
     assert metadata(tmp_path, action_space=DISCRETE, preprocess_type="GREY_SCALE", x=[None]) == wanted
 
 
@@ -232,5 +232,5 @@ def test_written_files_read_as_they_were(tmp_path, kind):
     assert (found, found.renumbered) == (spaces[kind], False)
     values = Hyperparameters(batch_size=128, lr=1e-5, loss_type="huber", term_cond_max_episodes=7)
     read = hyperparameters(tmp_path, hyperparameters_text(values))
-    assert replace(read, given=()) == values
-    assert sorted(read.given) == sorted(KEYS)
+    assert replace(read, set_keys=()) == values
+    assert sorted(read.set_keys) == sorted(KEYS)

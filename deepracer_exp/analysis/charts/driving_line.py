@@ -126,10 +126,12 @@ def speed_steering_by_waypoint(view: LogView) -> Chart | None:
             (minimum_curvature_line(view.course), "racing line", VERMILION),
             (center_line(view.course), "centre line", ORANGE),
         ):
-            speed_mps = ideal.at(places, ideal.speed_mps(grip_mps2, top_mps))
+            speed_mps = ideal.interpolate(places, ideal.speed_mps(grip_mps2, top_mps))
             x, words = np.arange(len(places)), f"{name}, cornering at {grip_mps2:.1f} m/s²"
             panels["track_speed_mps"].append(line(x, speed_mps, color, words, dashed=True))
-            panels["steer"].append(line(x, ideal.at(places, ideal.steering_deg), color, name, dashed=True))
+            panels["steer"].append(
+                line(x, ideal.interpolate(places, ideal.steering_deg), color, name, dashed=True)
+            )
     return Chart(
         name="speed_steering_by_waypoint",
         title="Speed and steering by waypoint",
@@ -159,7 +161,7 @@ def racing_line(view: LogView) -> Chart | None:
     x = np.arange(n)
     rows = rows.iloc[subsample(len(rows), MOST_ROWS)]
     waypoint = closest_waypoints(rows)
-    away_m = rows["offset_m"] - ideal.at(rows["lap_position"], ideal.offset_m)
+    away_m = rows["offset_m"] - ideal.interpolate(rows["lap_position"], ideal.offset_m)
     low, middle, high = quantiles(waypoint, away_m, n, (0.1, 0.5, 0.9))
     places = waypoint_positions(course)[:n]
     median = beside(course, places, quantiles(waypoint, rows["offset_m"], n, (0.5,))[0][: len(places)])
@@ -174,7 +176,7 @@ def racing_line(view: LogView) -> Chart | None:
     ]
     lap = view.fastest_lap(*columns)
     if lap is not None:
-        own_m = lap["offset_m"] - ideal.at(lap["lap_position"], ideal.offset_m)
+        own_m = lap["offset_m"] - ideal.interpolate(lap["lap_position"], ideal.offset_m)
         line_driven = _without_gaps(means(closest_waypoints(lap), own_m, n))
         paths.append(line(lap["X"], lap["Y"], INK, "fastest lap", width=1.5))
         layers.append(line(x, line_driven, INK, "fastest lap", width=1.5))

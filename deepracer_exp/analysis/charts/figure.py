@@ -220,12 +220,14 @@ def heatmap(
     )
 
 
-def mark(at: float, label: str, color: str, *, horizontal: bool = False, in_legend: bool = False) -> Shape:
+def mark(
+    position: float, label: str, color: str, *, horizontal: bool = False, in_legend: bool = False
+) -> Shape:
     """Return a dashed line across the panel, labelled at its end or in the legend; an empty label: the line alone."""
-    ends = {"xref": "x domain", "x0": 0, "x1": 1, "yref": "y", "y0": at, "y1": at}
+    ends = {"xref": "x domain", "x0": 0, "x1": 1, "yref": "y", "y0": position, "y1": position}
     text = {"text": escaped(label), "textposition": "end", "font": {"size": 12, "color": INK}}
     if not horizontal:
-        ends = {"xref": "x", "x0": at, "x1": at, "yref": "y domain", "y0": 0, "y1": 1}
+        ends = {"xref": "x", "x0": position, "x1": position, "yref": "y domain", "y0": 0, "y1": 1}
         text |= {"xanchor": "right", "yanchor": "top"}  # below the upper end, to the right of the line
     return Shape(
         type="line",

@@ -57,7 +57,7 @@ class LogFile:
     parts: tuple[str, ...]
     """Names of the folders it is in, as far as they matter, and its own name."""
     opener: Callable[..., IO[bytes]]
-    given: tuple[object, ...] = ()
+    arguments: tuple[object, ...] = ()
 
     def __post_init__(self) -> None:
         """Make the names printable."""
@@ -65,7 +65,7 @@ class LogFile:
 
     def open(self) -> IO[bytes]:
         """Open it for reading."""
-        return self.opener(*self.given)
+        return self.opener(*self.arguments)
 
     def head(self, most_bytes: int) -> bytes:
         """Return its first bytes, at most `most_bytes`."""
@@ -148,12 +148,12 @@ def without_worker(name: str) -> str:
     return name if match is None else f"{name[: match.start(1)]}#{name[match.end(1) :]}"
 
 
-def same_job(one: str, other: str) -> bool:
+def same_job(name: str, other: str) -> bool:
     """Return whether two names belong to one job, by the time stamp in them or the id after it."""
-    stamps = [set(_STAMP.findall(name)) for name in (one, other)]
+    stamps = [set(_STAMP.findall(name)) for name in (name, other)]
     if stamps[0] & stamps[1]:
         return True
-    first, second = (_STAMP.split(label(name))[-1].strip("-_") for name in (one, other))
+    first, second = (_STAMP.split(label(name))[-1].strip("-_") for name in (name, other))
     return bool(stamps[0] and stamps[1] and first and first == second)
 
 
@@ -296,7 +296,7 @@ def _unpack(
 def _lies_beside(path: Path, file: LogFile) -> bool:
     """Return whether a member of an archive is also unpacked beside it, with the same name and size."""
     named = (PACKED.sub("", path.name),)
-    _, member = file.given
+    _, member = file.arguments
     assert isinstance(member, ArchiveMember)
     for place in (file.parts, (*named, *file.parts), (*named, *file.parts[1:])):
         with contextlib.suppress(OSError):  # not there, or a name that no file system takes

@@ -202,7 +202,7 @@ def _read_hyperparameters(parts: Parts, file: LogFile, raw: bytes) -> None:
     refused: list[str] = []
     settings = read_hyperparameters(file.path, raw, refused)
     parts.hyperparameters.append(
-        (file, {key: getattr(settings, key) for key in settings.given if hasattr(settings, key)})
+        (file, {key: getattr(settings, key) for key in settings.set_keys if hasattr(settings, key)})
     )
     parts.refuse(file, [(None, f"hyperparameters: {reason}") for reason in refused])
 

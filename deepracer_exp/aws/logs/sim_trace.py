@@ -117,7 +117,7 @@ class StepTables:
         return True
 
     @property
-    def found(self) -> bool:
+    def has_lines(self) -> bool:
         """Whether the file had any rows, or lines that should have been rows."""
         return bool(self._tables) or self.left_out > 0
 

@@ -88,7 +88,7 @@ class TrainingLog:
     def recognised(self) -> bool:
         """Whether it is a log of the service at all."""
         read = (self.updates, self.iteration_of, self.hyperparameters, self.sensors, self.world, self.saved)
-        return self.steps.found or any(map(bool, read))
+        return self.steps.has_lines or any(map(bool, read))
 
     @property
     def metadata(self) -> dict[str, Any] | None:

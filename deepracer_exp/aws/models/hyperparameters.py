@@ -63,7 +63,7 @@ class Hyperparameters:
     """Training iterations, in spite of its name."""
     term_cond_avg_score: float = 100_000.0
     sac_alpha: float = 0.2
-    given: tuple[str, ...] = ()
+    set_keys: tuple[str, ...] = ()
     """Keys of the file, in its order; the service ignores those not in KEYS."""
 
     def beyond_console(self) -> tuple[str, ...]:
@@ -109,7 +109,7 @@ def read_hyperparameters(
             refused.append(error.without(path))
         else:
             set_keys.append(key)
-    return Hyperparameters(**values, given=tuple(set_keys))  # type: ignore[arg-type]
+    return Hyperparameters(**values, set_keys=tuple(set_keys))  # type: ignore[arg-type]
 
 
 def hyperparameters_text(values: Hyperparameters) -> str:

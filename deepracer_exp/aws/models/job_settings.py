@@ -43,7 +43,7 @@ class JobSettings:
     """Path of the file."""
     keys: Mapping[str, str]
     """The file's names for the keys of training_params.yaml."""
-    given: tuple[str, ...]
+    set_keys: tuple[str, ...]
     """The file's own keys, in its order."""
     world: str | None
     is_clockwise: bool | None
@@ -134,7 +134,7 @@ def _read_env(path: str) -> dict[str, str]:
 
 
 def _settings(
-    path: str, values: Mapping[str, str], keys: Mapping[str, str], given: tuple[str, ...]
+    path: str, values: Mapping[str, str], keys: Mapping[str, str], set_keys: tuple[str, ...]
 ) -> JobSettings:
     def truth(key: str) -> bool | None:
         if (word := values.get(keys.get(key, key))) is None:
@@ -163,7 +163,7 @@ def _settings(
     return JobSettings(
         file=path,
         keys=keys,
-        given=given,
+        given=set_keys,
         world=values.get(keys["WORLD_NAME"]) or None,
         is_clockwise=truth("TRACK_DIRECTION_CLOCKWISE"),
         race_type=race_type,

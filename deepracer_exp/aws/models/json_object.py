@@ -37,12 +37,12 @@ class JsonObject:
         shown = shown if len(shown) <= 80 else shown[:79] + "…"
         return BadInput(self.path, f"{key}: {shown}", accepted)
 
-    def choice(self, key: str, value: object, known: Sequence[str], lower: bool = True) -> str:
+    def choice(self, key: str, value: object, options: Sequence[str], lower: bool = True) -> str:
         """Return one of the known words, stripped and by default lower-cased, as the service reads it."""
         word = value.strip() if isinstance(value, str) else ""
         word = word.lower() if lower else word
-        if word not in known:
-            raise self.bad(key, value, ", ".join(known) + nearest(word, known))
+        if word not in options:
+            raise self.bad(key, value, ", ".join(options) + nearest(word, options))
         return word
 
     def number(self, key: str, value: object, low: float, high: float, unit: str = "") -> float:

@@ -62,7 +62,7 @@ class ModelMetadata:
     """Version of the simulator; 5 is the newest that deepracer-for-cloud writes."""
     training_algorithm: str = "clipped_ppo"
     lidar_config: LidarSectors = SERVICES_SECTORS
-    given: tuple[str, ...] = field(default=(), compare=False)
+    set_keys: tuple[str, ...] = field(default=(), compare=False)
     """Keys of the file, in its order; the service ignores those not in KEYS."""
     renumbered: bool = field(default=False, compare=False)
     """Whether the `index` of an action differs from its position; the position counts."""
@@ -89,9 +89,9 @@ def read_model_metadata(path: str | Path, raw: bytes | None = None) -> ModelMeta
     file = JsonObject(path, "a model_metadata.json", "a JSON object with action_space", raw)
     data = file.data
 
-    def choice(key: str, known: tuple[str, ...], lower: bool = True) -> str:
+    def choice(key: str, options: tuple[str, ...], lower: bool = True) -> str:
         value = data.get(key)
-        return known[0] if value is None else file.choice(key, value, known, lower)
+        return options[0] if value is None else file.choice(key, value, options, lower)
 
     kind = choice("action_space_type", ("discrete", "continuous"))
     algorithm = choice("training_algorithm", ("clipped_ppo", "sac"))
@@ -116,7 +116,7 @@ def read_model_metadata(path: str | Path, raw: bytes | None = None) -> ModelMeta
         version=version,
         training_algorithm=algorithm,
         lidar_config=_lidar_config(file) if set(sensor) & set(LIDARS) else SERVICES_SECTORS,
-        given=tuple(data),
+        set_keys=tuple(data),
         renumbered=isinstance(space, list)
         and any(str(item.get("index", number)) != str(number) for number, item in enumerate(space)),
     )
