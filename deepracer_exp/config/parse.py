@@ -38,7 +38,7 @@ def parse_config(mapping: dict[str, Any], kind: type[Config]) -> Config:
     """
     try:
         # JSON is the strict mode that still takes a YAML list for a tuple and 1 for 1.0.
-        adapter: TypeAdapter[Config] = _adapter(kind)
+        adapter: TypeAdapter[Config] = _adapter(kind)  # type: ignore[arg-type]
         return adapter.validate_json(json.dumps(mapping), strict=True, extra="forbid")
     except ValidationError as error:
         raise _first_finding(mapping, error) from error

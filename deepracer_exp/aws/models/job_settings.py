@@ -163,7 +163,7 @@ def _settings(
     return JobSettings(
         file=path,
         keys=keys,
-        given=set_keys,
+        set_keys=set_keys,
         world=values.get(keys["WORLD_NAME"]) or None,
         is_clockwise=truth("TRACK_DIRECTION_CLOCKWISE"),
         race_type=race_type,
