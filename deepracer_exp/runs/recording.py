@@ -50,8 +50,7 @@ EVALUATION_COLUMNS: Mapping[str, tuple[str, str]] = {
 }
 """Columns of `Recording.evaluations`: type and meaning with unit."""
 
-_CONSTANT = {"stream": TRAINING, "worker": 0, "wall_clock": np.nan}
-_READ = [name for name in STEP_COLUMNS if name not in _CONSTANT]
+_READ = [name for name in STEP_COLUMNS if name in SCHEMA.names]
 _SCHEMA = pa.schema([SCHEMA.field(name) for name in _READ])
 _ACTION_SPACE: TypeAdapter[ActionSpaceConfig] = TypeAdapter(ActionSpaceConfig)
 
@@ -153,8 +152,10 @@ def _steps(folder: Path, problems: list[LogProblem], files: list[Path]) -> pd.Da
     whole = pa.concat_tables([tables.pop(path) for path in sorted(tables)]).unify_dictionaries()
     columns: dict[str, Any] = {}
     for name, (kind, _) in STEP_COLUMNS.items():
-        if name in _CONSTANT:
-            columns[name] = _constant(name, len(whole))
+        if name == "stream":
+            columns[name] = pd.Categorical.from_codes(np.zeros(len(whole), np.int8), [TRAINING])
+        elif name not in _READ:  # of the service's logs alone
+            columns[name] = np.full(len(whole), 0 if name == "worker" else np.nan, kind)
         elif kind == "category":
             columns[name] = whole[name].to_pandas()
         else:
@@ -164,12 +165,6 @@ def _steps(folder: Path, problems: list[LogProblem], files: list[Path]) -> pd.Da
     others = [word for word in words.categories if word not in EPISODE_STATUS]
     steps["episode_status"] = words.set_categories([*EPISODE_STATUS, *others])
     return steps
-
-
-def _constant(name: str, count: int) -> Any:
-    if name == "stream":
-        return pd.Categorical.from_codes(np.zeros(count, np.int8), [TRAINING])
-    return np.full(count, _CONSTANT[name], STEP_COLUMNS[name][0])
 
 
 def _config(folder: Path, problems: list[LogProblem], files: list[Path]) -> Mapping[str, Any]:

@@ -87,6 +87,14 @@ def test_the_entropy_of_each_run_is_drawn_under_its_outcome_up_to_its_end(study,
     assert all(points[-1][0] == 8192 * len(points) for points in found.values())
 
 
+def test_a_rule_of_ones_own_does_not_count_as_a_used_budget(tmp_path):
+    study = new_study(tmp_path)
+    for ending in ("finished", "lap_under"):
+        add(study, [9.0], ending)
+    add(study, None, "lap_under", seen=9.0)
+    assert list(map(ending_of, study.trials)) == ["finished", "other_rule", "pruned"]
+
+
 def test_runs_that_are_gone_or_incomplete_leave_a_figure_of_the_others(tmp_path):
     study = new_study(tmp_path)
     for _ in range(4):

@@ -25,6 +25,7 @@ ENDINGS: Mapping[str, EndingStyle] = {
     "overfitting": EndingStyle("#E0C0A0", "dash", "lost held-out conditions while its return held"),
     "collapsed": EndingStyle("#D55E00", "dash", "entropy fell before it could drive"),
     "not_learning": EndingStyle("#E69F00", "dot", "entropy and completion stayed where they began"),
+    "other_rule": EndingStyle("#44AA99", "longdash", "ended by another stopping rule"),
     "median": EndingStyle("#CC79A7", "dash", "worse than the median of the others at the same point"),
     "percentile": EndingStyle("#882255", "dot", "not among the best share of the others at the same point"),
     "hyperband": EndingStyle("#A060E0", "dashdot", "lost its bracket"),
@@ -44,7 +45,8 @@ def ending_of(trial: FrozenTrial) -> str:
     if not trial.state.is_finished():
         return "running"
     stored = Trial.of(trial).ending
-    return stored if stored in ENDINGS else _BY_STATE[trial.state]
+    is_another_rule = stored and trial.state == TrialState.COMPLETE
+    return stored if stored in ENDINGS else "other_rule" if is_another_rule else _BY_STATE[trial.state]
 
 
 def ending_words(ending: str) -> str:
