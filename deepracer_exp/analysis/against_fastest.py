@@ -74,9 +74,7 @@ def loss(view: LogView, folder: Path) -> Loss | None:
 def by_cause(lap: pd.DataFrame, fastest: pd.DataFrame) -> pd.DataFrame:
     """Divide the time that a lap loses.
 
-    Args:
-        lap: of each sector `time_s`, `way_m` and `smooth_m`, the way without what steering to and fro adds.
-        fastest: likewise.
+    Both have of each sector `time_s`, `way_m` and `smooth_m`, the way without what steering to and fro adds.
 
     Returns:
         Seconds by `CAUSES`, whose sum is the difference of `time_s`. A longer line costs its length at the speed of the

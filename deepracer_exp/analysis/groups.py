@@ -78,9 +78,8 @@ def course_of(record: RunRecord) -> str:
 def group_runs(named: Iterable[tuple[str | None, RunRecord]]) -> list[RunGroup]:
     """Put runs into groups.
 
-    Args:
-        named: runs, each with the name of the group that it was given to; None: it belongs to the runs of the same
-            settings but for seed, track, experiment and version of the code.
+    Each run comes with the name of the group that it was given to; None: it belongs to the runs of the same settings
+    but for seed, track, experiment and version of the code.
     """
     pairs = list(named)
     records = [record for _, record in pairs]

@@ -33,9 +33,8 @@ _OFFERED = 5
 def recorded_line(view: "LogView", episode: int | None) -> tuple["pd.DataFrame", str]:
     """Return the line of a complete lap, a point a control step, and which lap it is in words.
 
-    Args:
-        view: of a recording. The points are those that it logs, at the front of the car.
-        episode: number of the lap in `view.episodes`; None: the fastest.
+    The points are those that the recording logs, at the front of the car. `episode` is a number of `view.episodes`;
+    None: the fastest.
 
     Raises:
         BadInput: there is no complete lap, or the episode is none.

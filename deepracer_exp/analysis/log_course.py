@@ -150,11 +150,7 @@ def recorded_wheels_on_road(
 ) -> NDArray[np.bool_]:
     """Return which wheels of a recorded car were on the road, (n, 4), rebuilt from X, Y and yaw.
 
-    Args:
-        tracks: the courses.
-        track_index: index of each row's course in them, as `Tracks.on_road` takes them.
-        steps: rows with finite X, Y and yaw, (n,).
-        car: with the positions of its wheels and front.
+    The steps have finite X, Y and yaw, (n,); `track_index` is the course of each, as `Tracks.on_road` takes it.
     """
     # Recorded poses are of the front point; wheels are measured from the chassis origin.
     wheels_m = np.array(car.wheel_points_m) - [car.front_point_m, 0.0]

@@ -98,12 +98,10 @@ def _curvature(course: Track, place: Values) -> Values:
 def interval_times(steps: pd.DataFrame, bounds: Values) -> pd.DataFrame:
     """Return the seconds each complete lap spends between places, interpolated along the lap position.
 
+    `steps` are those of a `LogView`, training or evaluations; `bounds` are lap positions (n + 1,), growing from 0 to 1.
+
     The interval in which a lap begins is driven in two parts, at its beginning and at its end, so that the times of a
     lap always add up to its lap time.
-
-    Args:
-        steps: of a `LogView`, training or evaluations.
-        bounds: lap positions (n + 1,), growing from 0 to 1.
 
     Returns:
         A row for each lap (`tables.laps_driven`), a column for each interval; the index is that of `LogView.episodes`.

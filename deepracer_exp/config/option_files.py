@@ -141,9 +141,7 @@ class OptionFolders(SearchPathPlugin):
 def composed(entry: str | None, lines: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
     """Let Hydra compose a file of `conf/`, or options alone.
 
-    Args:
-        entry: name of the file; None: there is none.
-        lines: choose an option of a group each, in Hydra's grammar.
+    `entry` is the name of a file, or None; the lines choose an option of a group each, in Hydra's grammar.
 
     Returns:
         The values, without Hydra's own settings; the option chosen in each group.

@@ -153,9 +153,8 @@ class Question:
     def bound(self, driven: Floats | None = None) -> tuple[float, Floats]:
         """Return the bound from below of the lap time in s, and its line, (n, 2).
 
-        Args:
-            driven: chassis origins of a lap (n, 2), from whose line the search for the least time begins, in place
-                of simple lines.
+        `driven` are chassis origins of a lap (n, 2), from whose line the search for the least time begins, in place of
+        simple lines.
         """
         car = self.experiment.car
         least_s, line = fastest_line(self.track, car.reach_m, self._ability, 0.0, car.front_point_m, driven)

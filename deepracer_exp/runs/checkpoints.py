@@ -151,11 +151,9 @@ class CheckpointStore:
     def __init__(self, run_dir: Path, keep: int, every: int | None = None):
         """Open the folder, make it if there is none, and clear away what a kill left unfinished.
 
-        Args:
-            run_dir: folder of the run.
-            keep: how many of the newest checkpoints stay.
-            every: iterations between two evaluations: only evaluated checkpoints stay, so that all of them can be
-                compared at the end; None: there are no evaluations, and any checkpoint stays.
+        `keep` of the newest checkpoints stay. With `every` iterations between two evaluations only evaluated
+        checkpoints stay, so that all of them can be compared at the end; None: there are no evaluations, and any
+        checkpoint stays.
 
         Raises:
             BadInput: it is not known which checkpoints must stay.

@@ -79,10 +79,8 @@ class Decision:
 def entropy_share(entropy: float, at_start: float, action_count: int | None) -> float:
     """Return a policy's entropy as a share.
 
-    Args:
-        entropy: in nats.
-        at_start: the entropy at the start of the run; looked at for a continuous policy only.
-        action_count: number of discrete actions, None for the two continuous ones.
+    Entropies are in nats; that at the start of the run is looked at for a continuous policy only, whose `action_count`
+    is None.
 
     Returns:
         For a discrete policy its entropy over that of a uniform choice, log(n): 0 to 1. A continuous policy's entropy

@@ -74,9 +74,8 @@ class Segments(NamedTuple):
 def build_segments(vertices: np.ndarray) -> Segments:
     """Index a polyline.
 
-    Args:
-        vertices: Points (n + 1, 2) in metres; the first is repeated at the end of a closed line. Points that
-            repeat the one before make no segment; `Segments.point` keeps their numbers.
+    `vertices` are points (n + 1, 2) in metres; the first is repeated at the end of a closed line. Points that repeat
+    the one before make no segment; `Segments.point` keeps their numbers.
     """
     point = np.flatnonzero(is_first_of_equals(vertices))
     x, y = np.ascontiguousarray(vertices[point].T)

@@ -180,9 +180,7 @@ class Track:
     def from_config(cls, config: TrackConfig, reversed: bool | None = None) -> "Track":
         """Build the course of an experiment: a world of the service, a file, or knots.
 
-        Args:
-            config: The track's configuration.
-            reversed: Drive against the order of the rows; None: as in the first episode by `config.direction`.
+        Driven against the order of the rows if `reversed`; None: as in the first episode by `config.direction`.
 
         Raises:
             BadInput: The file or the knots do not form a course; the message names the file or the track.
@@ -221,10 +219,8 @@ class Track:
     def border_distances(self, points: np.ndarray, center: np.ndarray) -> Borders:
         """Return the road's width at projected points and the side the points are on.
 
-        Args:
-            points: (n, 2) in metres.
-            center: Their projections (n, 2), from `project`. The nearest point of each border is the one
-                nearest to the projection, not to the point itself.
+        Points and their projections (from `project`) are (n, 2), in metres. The nearest point of each border is the one
+        nearest to the projection, not to the point itself.
         """
         return self._alone.border_distances(points, center, _FIRST)
 

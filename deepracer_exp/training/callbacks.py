@@ -40,15 +40,9 @@ def standard_callbacks(
 ) -> list[Callback]:
     """Return the callbacks of a run in the order in which they are called.
 
-    Args:
-        experiment: what is trained.
-        setup: its files, read.
-        names: what a racer calls the choices.
-        tracker: records the run.
-        console: shows the progress.
-        users: the caller's, called after evaluation and stopping rule and before anything is recorded: columns that
-            they add to `trainer.row` are recorded, and an iteration at which one raises is not.
-        rival: the other run that the evaluation races against, too; None: it has none, or its own snapshots.
+    `users` are the caller's, called after evaluation and stopping rule and before anything is recorded: columns that
+    they add to `trainer.row` are recorded, and an iteration at which one raises is not. `rival` is the other run that
+    the evaluation races against, too; None: it has none, or its own snapshots.
 
     Raises:
         BadInput: files or values of the evaluation or the alerts cannot be used.

@@ -313,9 +313,7 @@ class TrackTable:
     def lines(self, width: int, room: int) -> list[Text]:
         """Return the table, tracks running down its columns.
 
-        Args:
-            width: columns of the terminal to fill.
-            room: lines that are free; tracks that do not fit are counted at the end.
+        Tracks that do not fit into `room`, the free lines, are counted at the end.
         """
         columns = max(1, (width + _TABLE_GAP) // (_CELL + _TABLE_GAP))
         cell = (width + _TABLE_GAP) // columns - _TABLE_GAP
@@ -348,10 +346,8 @@ def _columns(name: str, done: str, best: str, cell: int) -> str:
 def sparkline(values: list[float], width: int, bounds: tuple[float, float] | None = None) -> str:
     """Draw values as at most `width` bars, each the mean of its share of them.
 
-    Args:
-        values: finite numbers, oldest first.
-        width: most characters.
-        bounds: values of the lowest and the highest bar; without them, those of the bars themselves.
+    The values are finite, the oldest first. `bounds` are those of the lowest and the highest bar; without them, the
+    bars' own.
     """
     count = min(width, len(values))
     edges = [place * len(values) // count for place in range(count + 1)] if count else []

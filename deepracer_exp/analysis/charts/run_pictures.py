@@ -143,11 +143,10 @@ def lines_figure(shown: Sequence[TrackLines]) -> Figure:
 def learning_curves(metrics: pd.DataFrame) -> Figure:
     """Draw how a run learned: completion, return, lap times and entropy against control steps.
 
-    With several tracks, completion and lap times have a thin line for each.
+    The rows are those of metrics.jsonl; `completion` in per cent, `lap_share` a fraction; `completion/TRACK` and
+    `mean_lap_time_s/TRACK` of each of several tracks.
 
-    Args:
-        metrics: rows of metrics.jsonl; `completion` in per cent, `lap_share` a fraction; `completion/TRACK` and
-            `mean_lap_time_s/TRACK` of each of several tracks.
+    With several tracks, completion and lap times have a thin line for each.
     """
     tracks = [name.removeprefix("completion/") for name in metrics if name.startswith("completion/")]
     figure = Figure((10.0, 6.0 + 0.3 * math.ceil(len(tracks) / 5)), dpi=150, layout=_LAYOUT)

@@ -191,13 +191,11 @@ def read_rows(
 ) -> tuple[pa.Table, list[tuple[int, str]]]:
     """Read the lines of a trace.
 
-    A single line with fewer values than its neighbours is incomplete, even if an older generation had so many.
+    `data` are lines of comma-separated values, without what precedes them in a log. `layouts` has the columns by the
+    number of values, `before` how many of these the line before the first had; blank lines are ignored with
+    `skip_blank`, else refused.
 
-    Args:
-        data: lines of comma-separated values, without what precedes them in a log.
-        layouts: the columns by the number of values.
-        before: how many values the line before the first had; None if there was none.
-        skip_blank: whether blank lines are ignored, not refused.
+    A single line with fewer values than its neighbours is incomplete, even if an older generation had so many.
 
     Returns:
         Rows in the order of lines with the columns of `SCHEMA`; and of the lines that are not rows, the index and the

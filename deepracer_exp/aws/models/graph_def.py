@@ -223,12 +223,10 @@ def read_weights(
 ) -> dict[str, Tensor]:
     """Return the kernels and biases of a frozen graph by the names of their nodes.
 
-    Nothing is allocated from a size that the file declares: the tensors are views of its bytes, read-only.
+    `raw` is its content if known, e.g. of a member of an archive. `has_tangent`: whether the policy's output may go
+    through a hyperbolic tangent, as an exported SAC policy's does.
 
-    Args:
-        path: of the file.
-        raw: its content if known, e.g. of a member of an archive.
-        has_tangent: whether the policy's output may go through a hyperbolic tangent, as an exported SAC policy's does.
+    Nothing is allocated from a size that the file declares: the tensors are views of its bytes, read-only.
 
     Raises:
         BadInput: it cannot be read, is larger than `GRAPH_BYTES`, or not a frozen graph; or has such an output, with
