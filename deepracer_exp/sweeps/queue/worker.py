@@ -307,7 +307,7 @@ class TrialRun(Callback):
         return replace(run, took_s=round(time.monotonic() - began, 1))
 
     def _trained(self, overrides: Sequence[str]) -> TrainResult:
-        usual = [*overrides, f"name={self._config.study}", f"runs_dir={self._config.runs_dir}"]
+        lines = [*overrides, f"name={self._config.study}", f"runs_dir={self._config.runs_dir}"]
         # Where a trial's cars drive is no part of it, and left out of the command that repeats it.
         keys = {key_of(override) for override in overrides}
         where: list[str] = []
@@ -315,14 +315,14 @@ class TrialRun(Callback):
             where = ["collector.mode=in_process", "collector.processes=null"]
         if "collector.threads" not in keys:
             where.append(f"collector.threads={self._config.cores}")
-        usual += where if "report" in keys else [*where, "report=false"]
-        plan = self._planned(usual)
+        lines += where if "report" in keys else [*where, "report=false"]
+        plan = self._planned(lines)
         experiment = plan.experiment
         if experiment.observation.camera is not None:
             # Several threads update such networks, and the last digits depend on how many.
             self._patiently(lambda: self._trial.set_user_attr("where", where))
         if self._seed:
-            plan = self._planned([*usual, f"seed={experiment.seed + self._seed}"])
+            plan = self._planned([*lines, f"seed={experiment.seed + self._seed}"])
         title, tags = self._title_and_tags()
         return run_training(plan, None, [self], run_name=title, tags=tags, created=self._begin)
 
