@@ -25,7 +25,7 @@ ENDINGS: Mapping[str, EndingStyle] = {
     "overfitting": EndingStyle("#E0C0A0", "dash", "lost held-out conditions while its return held"),
     "collapsed": EndingStyle("#D55E00", "dash", "entropy fell before it could drive"),
     "not_learning": EndingStyle("#E69F00", "dot", "entropy and completion stayed where they began"),
-    "other_rule": EndingStyle("#44AA99", "longdash", "ended by another stopping rule"),
+    "other_rule": EndingStyle("#663300", "dash", "ended by another stopping rule"),
     "median": EndingStyle("#CC79A7", "dash", "worse than the median of the others at the same point"),
     "percentile": EndingStyle("#882255", "dot", "not among the best share of the others at the same point"),
     "hyperband": EndingStyle("#A060E0", "dashdot", "lost its bracket"),

@@ -94,7 +94,7 @@ class SearchSpace:
         for key in dict.fromkeys([*other, *here]):
             before, now = other.get(key), here.get(key)
             if before is None or now is None:
-                lines.append(f"{key}: {before or 'not axis'} -> {now or 'not axis'}")
+                lines.append(f"{key}: {before or 'not searched'} -> {now or 'not searched'}")
             elif before != now and dimension(key, before) != dimension(key, now):
                 lines.append(f"{key}: {before} -> {now}")
         return lines
