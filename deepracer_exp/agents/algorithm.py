@@ -51,11 +51,7 @@ class Algorithm:
     ) -> None:
         """Store the parts.
 
-        Args:
-            networks: Updated in place.
-            config: The group `algorithm`.
-            schedule: Of the learning rate.
-            seed: Of the algorithm's own random streams.
+        Networks are updated in place; the seed is that of the algorithm's own random streams.
         """
         self.networks, self.config, self.schedule = networks, config, schedule
 

@@ -49,14 +49,9 @@ def build_agent(
 ) -> Algorithm:
     """Return the algorithm of the group `algorithm`, with its learning-rate schedule.
 
-    Args:
-        networks: Of `build_networks`; updated by it in place.
-        config: The group `algorithm`.
-        lr_schedule: The group `lr_schedule`.
-        seed: Of the algorithm's own random streams.
-        teacher: A policy with the same actions that is imitated for the first `config.teacher_iterations`.
-        device: Where updates are computed; a class of the user's own chooses it itself.
-        commands: What the actions of a discrete policy mean, see `Smoothness`.
+    It updates the networks in place, on `device`; a class of the user's own chooses that itself. A `teacher`, a policy
+    with the same actions, is imitated for the first `config.teacher_iterations`. `commands` are what the actions of a
+    discrete policy mean, see `Smoothness`.
 
     Raises:
         BadInput: a class of the user's own cannot be used, or has no loss that could be smooth.

@@ -44,10 +44,7 @@ class InnerLoop:
     def __init__(self, networks: ActorCritic, optimizer: torch.optim.Adam, config: PPOConfig) -> None:
         """Use the parameters of the networks and the moments of the optimizer, which stay theirs.
 
-        Args:
-            networks: They fit, see `fits`.
-            optimizer: Of `networks.parameters()`, without weight decay.
-            config: Losses, clipping and their weights.
+        The networks fit (`fits`); the optimizer is that of `networks.parameters()`, without weight decay.
         """
         self._networks, self._optimizer, self._config = networks, optimizer, config
         layers, self._log_std = _policy_layers(networks)

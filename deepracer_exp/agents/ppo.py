@@ -67,12 +67,8 @@ class PPO(Algorithm):
     ) -> None:
         """Set up loss, advantages and optimizer.
 
-        Args:
-            actor_critic: On the CPU, where it drives; updated in place.
-            config: The group `algorithm`.
-            schedule: Of the learning rate.
-            seed: Of the stream that shuffles the minibatches.
-            device: Where updates are computed; if it is not the CPU, by a copy of the networks there.
+        The networks, on the CPU, where they drive, are updated in place; if `device` is not the CPU, by a copy of them
+        there. The seed is that of the stream that shuffles the minibatches.
         """
         super().__init__(actor_critic, config, schedule, seed)
         self._generator, self._seed = torch.Generator().manual_seed(seed), seed

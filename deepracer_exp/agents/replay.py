@@ -42,11 +42,8 @@ class Replay:
     ) -> None:
         """Begin without a step; the first batch says how many cars there are and how large a step is.
 
-        Args:
-            keys: What is kept of what the cars see.
-            most_steps: Bound of the ring.
-            most_bytes: Another one, of which the narrower holds.
-            generator: Draws the steps.
+        `keys` are those kept of what the cars see; of the bounds of the ring, `most_steps` and `most_bytes`, the
+        narrower holds.
         """
         self._keys, self._most_steps, self._most_bytes = tuple(keys), most_steps, most_bytes
         self._sampler, self._generator = _Complete(), generator

@@ -67,12 +67,8 @@ class SAC(Algorithm):
     ) -> None:
         """Set up replay, losses, targets and optimizer.
 
-        Args:
-            networks: On the CPU, where the policy drives; updated in place.
-            config: The group `algorithm`.
-            schedule: Of the learning rate.
-            seed: Of the streams that draw steps and actions.
-            device: Where updates are computed; if it is not the CPU, by a copy of the policy there.
+        The networks, on the CPU, where the policy drives, are updated in place; if `device` is not the CPU, by a copy
+        of the policy there. The seed is that of the streams that draw steps and actions.
         """
         super().__init__(networks, config, schedule, seed)
         self._device = device

@@ -79,16 +79,14 @@ class _Layer(NamedTuple):
 def to_service(networks: PolicyNetworks, sensors: Sequence[str]) -> dict[str, Array]:
     """Return the parameters as the service's tensors, by name.
 
+    `sensors` are the names of the camera and the LIDAR as in model_metadata.json.
+
     Kernels of convolutions are [height, width, in, out] and those of dense layers [in, out]; pictures are flattened
     row by row with all channels of a pixel together; the readings of sensors follow each other in the order of their
     names. Convolutions of 1x1 at the end of a picture's layers are the service's dense layers of an embedder, which it
     applies to each pixel. A trunk that both share is written twice. Where the value network does not see what the
     policy does, there are the policy's tensors alone, as of soft actor-critic, whose mean has the name of PPO's and
     comes before the hyperbolic tangent.
-
-    Args:
-        networks: of `SensorNet`s.
-        sensors: names of the camera and the LIDAR as in model_metadata.json.
 
     Raises:
         BadInput: the networks have layers that the service's do not.

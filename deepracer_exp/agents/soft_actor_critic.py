@@ -80,14 +80,9 @@ def build_soft_actor_critic(
 ) -> SoftActorCritic:
     """Build the networks with weights drawn from `generator`; arguments and errors as of `build_actor_critic`.
 
-    A network of the user's own is the policy; its critics are perceptrons that see features.
+    With `value_network` there is a network for the value of a state, too.
 
-    Args:
-        network: As there.
-        observed: As there.
-        action_count: As there.
-        generator: As there.
-        value_network: Whether there is a network for the value of a state.
+    A network of the user's own is the policy; its critics are perceptrons that see features.
     """
     continuous = action_count is None
     outputs = 2 * CONTINUOUS_ACTION_SIZE if action_count is None else action_count

@@ -28,9 +28,7 @@ class RaceEnv(EnvBase):
     def __init__(self, race: Race, on_step: Callable[[], None] | None = None):
         """Wrap a race.
 
-        Args:
-            race: the cars.
-            on_step: called after every step, as a heartbeat.
+        `on_step` is called after every step, as a heartbeat.
         """
         super().__init__(device="cpu", batch_size=[race.n_cars])
         self.race = race

@@ -210,10 +210,7 @@ class Randomization:
     ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
         """Return the commands that reach the cars after delay, sag, noise and offset.
 
-        Args:
-            steering_deg: commanded, (N,).
-            speed_mps: commanded, (N,).
-            steps: control steps of the episode, the prepare step being 1, (N,).
+        Commands and control steps of the episode, the prepare step being 1, are (N,) each.
 
         Returns:
             Steering, speed, and False for cars that no command has reached yet, each (N,).

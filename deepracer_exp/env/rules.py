@@ -231,10 +231,7 @@ class RaceRules:
     def put_back(self, ids: Ids, percent: np.ndarray) -> Pose:
         """Continue the cars' episodes from another place and return where their chassis origins are put.
 
-        Args:
-            ids: indices of the cars.
-            percent: progress at which they continue, (n,). The front of the car is put there, but its chassis origin
-                not behind the start.
+        The front of the car is put at that progress in per cent, (n,), but its chassis origin not behind the start.
         """
         length_m = self.length_m[ids]
         ahead_m = np.maximum(percent / 100.0 * length_m - self._front_point_m, 0.0)

@@ -89,10 +89,7 @@ SCHEMA = pa.schema([pa.field(name, kind, metadata={"unit": unit}) for name, kind
 def to_table(packed: NDArray[np.float64], iteration: int, tracks: Sequence[str]) -> pa.Table:
     """Turn packed rows into a table with the types and units of `SCHEMA`.
 
-    Args:
-        packed: (n, len(PACKED_COLUMNS)).
-        iteration: policy update that used the rows, from 1.
-        tracks: names of the experiment's courses.
+    `packed` is (n, len(PACKED_COLUMNS)); `iteration` is the policy update that used the rows, from 1.
 
     Raises:
         ValueError: the shape is wrong, or a code of a status or course is unknown.

@@ -103,14 +103,8 @@ def write_evaluation(
 ) -> Path:
     """Write `evaluations/<time>.json` into a run's folder and return it.
 
-    Args:
-        folder: of the run.
-        evaluation: the results.
-        config: the protocol.
-        stored: the checkpoint.
-        car: what `race_car_parts` returns.
-        places: what `official_places` returns.
-        rival: names of the run and checkpoint that drove the other car; None: there was none, or the policy itself.
+    `car` and `places` are what `race_car_parts` and `official_places` return; `rival` names the run and checkpoint that
+    drove the other car, None: there was none, or the policy itself.
 
     Raises:
         RunFailed: the file cannot be written.

@@ -83,11 +83,7 @@ class RaceProtocol:
     ):
         """Start all trials.
 
-        Args:
-            config: the protocol.
-            closed: whether a completed lap leads into the next one, (N,).
-            period_s: simulated seconds of a control step.
-            among_others: whether there are boxes or bots.
+        `closed` says whether a completed lap leads into the next one, (N,).
         """
         n_cars = len(closed)
         self._config, self._closed, self._period_s = config, closed, period_s
@@ -106,9 +102,7 @@ class RaceProtocol:
     def step(self, status: NDArray[np.int64], progress: Floats) -> PutBack:
         """Process one control step.
 
-        Args:
-            status: `env.trace.STATUS_CODE` of the poses, (N,).
-            progress: per cent of the lap, (N,).
+        Status codes are those of `env.trace.STATUS_CODE`, progress is in per cent of the lap, (N,) each.
 
         Returns:
             The cars to put back.

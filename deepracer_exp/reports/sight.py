@@ -40,14 +40,12 @@ GLIMPSES, _ENLARGED = 8, 240
 def saliency(policy: nn.Module, acted: TensorDict, camera: CameraConfig) -> NDArray[np.float32]:
     """Return how much a decision depends on each place of the pictures it was made from.
 
+    The policy reads `pixels` and perhaps more and writes `logits` or `loc`; `acted` is what it read and wrote in one
+    step, [].
+
     A place is blurred, in all pictures of its camera, and the policy decides again: the score of a place is the square
     of the change in the log-probability of the chosen action, for a continuous policy in the mean of steering and
     speed (Greydanus et al. 2018, Visualizing and Understanding Atari Agents, arXiv:1711.00138, section 3.1).
-
-    Args:
-        policy: reads `pixels` and perhaps more, writes `logits` or `loc`.
-        acted: what it read and wrote in one step, [].
-        camera: that took the pictures.
 
     Returns:
         0 to 1, the highest of them 1, for `picture_of` of the same step, (height, width).

@@ -75,11 +75,7 @@ class CarBatch:
     def place(self, ids: Ids, x_m: Floats, y_m: Floats, yaw_rad: Floats) -> None:
         """Put cars at rest, steering straight, with a fresh physics state.
 
-        Args:
-            ids: distinct indices of cars, (n,).
-            x_m: position of the chassis origin, (n,).
-            y_m: likewise.
-            yaw_rad: heading, likewise.
+        The cars are distinct; position of the chassis origin and heading are (n,) each.
         """
         com = self.car.com_x_m
         self._rows[ids] = self._rest_row

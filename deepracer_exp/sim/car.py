@@ -32,13 +32,11 @@ _RIM_RGBA = (0.75, 0.75, 0.78, 1.0)
 def build_spec(car: CarConfig, visual: bool = False) -> mujoco.MjSpec:
     """Build the car: a body that slides over the plane and turns; `tyres` push it.
 
+    With `visual`, for films, the car also has a shell, a camera housing, wheels that steer and spin, and a light: for
+    pictures of given poses, not for simulation.
+
     The joints `x` and `y` move the centre of mass, `yaw` turns the body about it: with all at zero the chassis origin
     is at the world's.
-
-    Args:
-        car: the car's dimensions and masses.
-        visual: for films, also give the car a shell, a camera housing and wheels that steer and spin, and add a
-            light. For pictures of given poses, not for simulation.
     """
     spec = mujoco.MjSpec()
     spec.modelname = car.name

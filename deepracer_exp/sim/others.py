@@ -144,13 +144,10 @@ class Others:
     def hit(self, x_m: Floats, y_m: Floats, yaw_rad: Floats) -> NDArray[np.int64]:
         """Return the first of the others that each car has run into, -1 where there is none, (N,).
 
+        Origins of the cars and headings are (N,) each.
+
         A car has run into another if one of the corners of its own rectangle is inside the other's; not the reverse
         (deepracer-simapp, track_geom/track_data.py: `get_collided_object_name`).
-
-        Args:
-            x_m: of the cars' origins, (N,).
-            y_m: of the cars' origins, (N,).
-            yaw_rad: headings, (N,).
         """
         return np.asarray(first_hit(x_m, y_m, yaw_rad, self.poses, self.half_m))
 

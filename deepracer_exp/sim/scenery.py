@@ -164,8 +164,7 @@ def paved_area(track: Track, kerb_m: float = KERB_WIDTH_M) -> BaseGeometry:
 def box_corners(boxes: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return where boxes stand, counter-clockwise corners (..., 4, 2).
 
-    Args:
-        boxes: x, y, yaw, length, width, ..., as `camera.take_pictures` has them, (..., 5 or more).
+    The boxes are as `camera.take_pictures` has them: x, y, yaw, length, width, ..., (..., 5 or more).
     """
     cos, sin = np.cos(boxes[..., 2, None]), np.sin(boxes[..., 2, None])
     along = 0.5 * boxes[..., 3, None] * np.array([-1, 1, 1, -1])
