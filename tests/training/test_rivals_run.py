@@ -1,0 +1,96 @@
+"""Training against rivals: the pool of snapshots, another run as the rival, and what is refused."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from deepracer_exp.runs.checkpoints import check, read_training
+from deepracer_exp.runs.files import read_metrics
+
+from .conftest import assert_same_run
+
+RACE = ("race=head_to_head", "observation.next_objects=1")
+OFTEN = (
+    "episode.max_steps=60",
+    "evaluation.time_s=4",
+    "checkpoints.every=2",
+    "algorithm.frames_per_iteration=512",
+)
+SIX, THREE = (("budget.env_steps=null", f"budget.iterations={count}") for count in (6, 3))
+
+
+def snapshots(run) -> list[int]:
+    return sorted(map(int, read_training(check(run / "checkpoints" / "last"))["rivals"]))
+
+
+def test_snapshots_are_taken_at_intervals_and_the_oldest_go(trained):
+    run = trained(*RACE, *OFTEN, *SIX, "race.rivals.snapshot_every=2", "race.rivals.pool_size=3").folder
+    assert snapshots(run) == [2, 4, 6]
+    run = trained(*RACE, *OFTEN, *SIX, "race.rivals.snapshot_every=4").folder
+    assert snapshots(run) == [0, 4]
+    won = [row.get("eval_won") for row in read_metrics(run / "metrics.jsonl")]
+    assert [value is None for value in won] == [True, False] * 3
+
+
+def test_the_rival_decides_what_is_learned(trained):
+    losses = []
+    for policy in ("newest", "pool"):
+        run = trained(
+            *RACE, *OFTEN, *SIX, "race.rivals.snapshot_every=1", f"race.rivals.policy={policy}"
+        ).folder
+        losses.append([row["policy_loss"] for row in read_metrics(run / "metrics.jsonl")])
+    # Up to the first iteration with two snapshots, and from then on.
+    assert losses[0][:1] == losses[1][:1]
+    assert losses[0][2:] != losses[1][2:]
+
+
+def test_against_another_run_a_resumed_training_needs_only_its_own_folder(trained, copied, call):
+    other = copied("observation.lookahead_m=[0.5,1.0]")  # sees something else, and no other car
+    against = (*RACE, *OFTEN, f"race.rivals.policy={other}")
+    whole = trained(*against, *SIX).folder
+    run = copied(*against, *THREE)
+    kept = run / "rival" / "checkpoints"
+    assert [path.name for path in kept.iterdir()] == [(other / "checkpoints" / "best").resolve().name]
+    shutil.rmtree(other)
+    ended = call("resume", run.name, "budget.iterations=6")
+    assert ended.code == 0, ended.stderr
+    assert_same_run(run, whole)
+
+
+def test_a_clone_begins_its_pool_with_its_parent_s_policy(copied, call, tmp_path):
+    parent = copied(*RACE, *OFTEN, *THREE)
+    ended = call("clone", parent.name, "budget.iterations=1", "name=child")
+    assert ended.code == 0, ended.stderr
+    (child,) = (tmp_path / "runs" / "child").glob("*/config.yaml")
+    pool = read_training(check(child.parent / "checkpoints" / "last"))["rivals"]
+    from deepracer_exp.lookup.resolve import StoredRun
+
+    policy = StoredRun(parent).with_policy().read_policy().networks.policy
+    for name, tensor in policy.state_dict().items():
+        np.testing.assert_array_equal(pool["0"][name], tensor.numpy())
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (("race.rivals.policy=nobody",), ("race.rivals.policy=nobody: no such run",)),
+        (
+            ("race.rivals.policy=OTHER",),
+            ("race.rivals.policy=", "has other actions: 15 actions", "a run with continuous"),
+        ),
+        (("race.rivals.policy=SAME", "race.rivals.checkpoint=77"), ("race.rivals.policy=", "77")),
+        (("race.rivals.checkpoint=last",), ("race.rivals", "checkpoint=last", "policy=RUN")),
+        (("race.rivals.pool_size=0",), ("race.rivals.pool_size",)),
+        (("race.bots.number=2",), ("without boxes and bots",)),
+        (("observation.next_objects=0",), ("would not see",)),
+    ],
+    ids=lambda value: " ".join(value),
+)
+def test_rivals_that_cannot_race_are_refused_before_anything_begins(trained, call, overrides, words):
+    names = {"OTHER": trained("action_space=discrete").folder, "SAME": trained().folder}
+    given = [
+        line if (name := line.partition("=")[2]) not in names else line.replace(name, str(names[name]))
+        for line in overrides
+    ]
+    call("train", "experiment=tiny", "tracking=off", *RACE, *given).assert_bad_input(*words)
