@@ -12,7 +12,7 @@ PROGRESS_WEIGHT = 1.0  # reward for 1 m along the centre line
 STEP_COST = 0.045  # what a step at 0.7 m/s gains
 OFF_ROAD_COST = 2.0  # cost of leaving the road
 CRASH_COST = 4.0  # cost of running into another from behind
-GAIN_WEIGHT = 0.5  # reward for 1 m gained on the nearest other
+GAIN_WEIGHT = 2.0  # reward for 1 m gained on the nearest other
 REACH_M = 2.0  # how far away along the lap an other counts
 STEP_S = 1 / 15  # duration of a control step
 

@@ -81,6 +81,7 @@ class RivalsConfig:
     checkpoint: Annotated[str, Field(min_length=1)] | None
     snapshot_every: Annotated[int, Field(ge=1, le=10**6)]
     pool_size: Annotated[int, Field(ge=1, le=100)]
+    pace: Range[Annotated[float, Field(ge=0.3, le=1, allow_inf_nan=False)]]
     start_gap_m: Annotated[float, Field(ge=0.4, le=5, allow_inf_nan=False)]
     pause_s: NonNegative
 

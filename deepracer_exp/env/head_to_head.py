@@ -11,6 +11,7 @@ from tensordict import TensorDict
 from torch.distributions import Categorical
 
 from deepracer_exp.config.driving import ObservationConfig, RandomizationConfig
+from deepracer_exp.config.race import RivalsConfig
 from deepracer_exp.rewards.prints import RewardPrints
 from deepracer_exp.rewards.source import NO_REWARD
 
@@ -76,11 +77,26 @@ class Rivals:
         return policies
 
 
+class _RivalRace(Race):
+    """The race of the rivals.
+
+    Attributes:
+        pace: speed of each over what its policy commands, (N,).
+    """
+
+    pace: Floats
+
+    def _commands(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        steering_deg, speed_mps = super()._commands(action)
+        return steering_deg, self.pace * speed_mps
+
+
 class HeadToHead(Race):
     """The race of N learners, each against a rival on the same track, stepped together.
 
     It is a `Race` of the learners. An episode of both begins and ends with the learner's. A rival takes the likeliest
-    actions of its policy; where it leaves the track, it is put back and stands for `race.rivals.pause_s`.
+    actions of its policy, in a training at the pace that the episode draws. Where it leaves the track, it is put back
+    and stands for `race.rivals.pause_s`.
 
     Attributes:
         rival: the race of the rivals; its car i is the rival of learner i.
@@ -97,7 +113,7 @@ class HeadToHead(Race):
         first_car: int = 0,
         prints: RewardPrints | None = None,
         randomizations: Sequence[RandomizationConfig] | None = None,
-        puts_rivals_back: bool = True,
+        evaluated: bool = False,
     ):
         """Build the cars; call `drive_with` and then `reset` next.
 
@@ -109,12 +125,13 @@ class HeadToHead(Race):
             first_car: as for `Race`; a rival has the number of its learner.
             prints: as for `Race`.
             randomizations: as for `Race`, of learners and rivals.
-            puts_rivals_back: whether this is done here; otherwise the caller does it by `put_rivals_back`.
+            evaluated: whether the caller puts rivals back, by `put_rivals_back`, and their pace is 1.
         """
-        self.rival = Race(rivals, n_cars, threads, first_car, None, randomizations)
+        self.rival = _RivalRace(rivals, n_cars, threads, first_car, None, randomizations)
+        self.rival.pace = np.ones(n_cars)
         assert isinstance(self.rival.others, RaceRival)
         self.rival.others.is_rival = True
-        self._pause_s = self._rivals_config(setup).pause_s if puts_rivals_back else None
+        self._training = None if evaluated else self._rivals_config(setup)
         self._policies: Sequence[torch.nn.Module] = ()
         self._share = np.zeros(n_cars)
         self._rival_percent = np.zeros(n_cars)
@@ -146,8 +163,10 @@ class HeadToHead(Race):
             return
         for race in (self, self.rival):
             race._start(ids, course, start_ndist)
+        low, high = (1.0, 1.0) if self._training is None else self._training.pace
         for car, episode in zip(ids.tolist(), self.rules.episode[ids].tolist(), strict=True):
-            self._share[car] = self._streams.stream(car, episode).random()
+            self._share[car], pace = self._streams.stream(car, episode).random(2)
+            self.rival.pace[car] = low + pace * (high - low)
         self._rival_percent[ids] = 0.0
         self._meet(ids)
         for race in (self, self.rival):
@@ -161,8 +180,8 @@ class HeadToHead(Race):
         self._meet(self._everyone)
         self.rival._look(theirs)
         self._look(action)
-        if self._pause_s is not None:
-            self._put_lost_rivals_back(self._pause_s)
+        if self._training is not None:
+            self._put_lost_rivals_back(self._training.pause_s)
 
     def put_back(
         self,
@@ -194,6 +213,7 @@ class HeadToHead(Race):
             **super().state_dict(),
             "rival": self.rival.state_dict(),
             "rival_share": self._share.copy(),
+            "rival_pace": self.rival.pace.copy(),
             "rival_percent": self._rival_percent.copy(),
         }
 
@@ -202,10 +222,11 @@ class HeadToHead(Race):
         super().load_state_dict(state)
         self.rival.load_state_dict(state["rival"])
         self._share = checked_array(state, "rival_share", self._share.shape)
+        self.rival.pace = checked_array(state, "rival_pace", self._share.shape)
         self._rival_percent = checked_array(state, "rival_percent", self._rival_percent.shape)
 
     @staticmethod
-    def _rivals_config(setup: RaceSetup) -> Any:
+    def _rivals_config(setup: RaceSetup) -> RivalsConfig:
         assert setup.others is not None
         assert setup.others.rivals is not None
         return setup.others.rivals

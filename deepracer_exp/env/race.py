@@ -283,7 +283,7 @@ class Race:
 
     def _act(self, action: np.ndarray) -> None:
         """Apply the rules, compute the rewards and move the cars; arguments and errors as for `step`."""
-        steering_deg, speed_mps = self.setup.actions.commands(action)
+        steering_deg, speed_mps = self._commands(action)
         result = self.rules.apply()
         objects: dict[str, np.ndarray] = {}
         if self.others is not None:
@@ -302,6 +302,10 @@ class Race:
             self._drive(steering_deg, speed_mps, result.running)
         except RunFailed as error:
             raise self._lost_car(error, action) from error
+
+    def _commands(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the steering in degrees and the speed in m/s that actions mean, (N,) each."""
+        return self.setup.actions.commands(action)
 
     def _look(self, action: np.ndarray) -> None:
         """Observe where the cars have come to by an action; errors as for `step`."""

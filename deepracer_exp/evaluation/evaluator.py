@@ -107,7 +107,7 @@ class Evaluator:
             Race(setup, len(self.trials), threads, randomizations=of_trials)
             if rivals is None
             else HeadToHead(
-                setup, len(self.trials), rivals, threads, randomizations=of_trials, puts_rivals_back=False
+                setup, len(self.trials), rivals, threads, randomizations=of_trials, evaluated=True
             )
         )
         self._course = np.array([trial.course for trial in self.trials])

@@ -171,6 +171,19 @@ def test_learner_and_rival_meet_the_same_conditions(duel):
     np.testing.assert_array_equal(race.randomization.values, race.rival.randomization.values)
 
 
+def test_a_rival_drives_at_the_pace_of_its_episode_in_a_training_only(duel):
+    for evaluated in (False, True):
+        race = duel("race.rivals.pace=[0.5,0.9]", n_cars=32, rival=SLOWLY, evaluated=evaluated)
+        for _ in range(10):
+            race.step(np.tile(STOP, (32, 1)))
+        pace = race.rival.trace[:, PACKED["throttle"]] / race.setup.actions.commands(SLOWLY[None])[1]
+        if evaluated:
+            np.testing.assert_allclose(pace, 1.0, rtol=1e-6)
+        else:
+            assert 0.499 < pace.min() < 0.6 < 0.8 < pace.max() < 0.901
+            assert (race.rival.rules.now.speed_mps.argsort()[[0, -1]] == pace.argsort()[[0, -1]]).all()
+
+
 def test_each_episode_draws_its_rival_among_all(duel):
     race = duel(n_cars=64)
     race.drive_with([Always(STOP), Always(SLOWLY)])

@@ -332,7 +332,7 @@ def test_overtake_pays_for_what_is_gained_on_a_near_car_ahead_or_behind() -> Non
     alone = beside_another("overtake", 8.0)
     # 0.1 m made, 0.05 m by the other.
     for gap_m in (1.5, 0.0, -1.5):
-        assert beside_another("overtake", gap_m) - alone == pytest.approx(0.5 * 0.05)
+        assert beside_another("overtake", gap_m) - alone == pytest.approx(2.0 * 0.05)
 
 
 def test_free_lane_costs_behind_a_near_object_on_the_own_side_only() -> None:
