@@ -14,8 +14,9 @@ from deepracer_exp.runs.result import RunResult
 from deepracer_exp.stopping.judge import POOR, convergence, convergence_rule, overfitting
 
 from . import off_track
-from .log_view import LEAST_EPISODES, LEAST_LAPS, LogView
+from .log_view import LEAST_EPISODES, LEAST_LAPS, LogView, thirds
 from .off_track import JUDGEMENTS, OffTrackPlace, off_track_places
+from .others import costliest
 from .sectors import Sector, sector_at, sectors_now, sectors_of
 from .slower_laps import CHANCE, LEAST_TIMES, SLOWER, slower_laps
 from .statistics import wilson
@@ -33,6 +34,7 @@ FIGURES = {
     "chance": "lap_time_histogram",
     "time_lost": "sector_times",
     "crashes": "episode_ends_map",
+    "costs_most": "crashes_by_object",
     "runs_off": "off_track_risk",
     "steering": "slide_map",
     "zigzag": "zigzag",
@@ -66,7 +68,7 @@ def findings(view: LogView, target_s: float | None = None) -> list[Finding]:
     if view.trained:
         overfits = _overfits(view)
         results += [_converged(view, overfits), _submit(view), _laps_slower(view)]
-    results += [_chance(view, target_s), _time_lost(view), _crashes(view), *_runs_off(view)]
+    results += [_chance(view, target_s), _time_lost(view), _crashes(view), _costliest(view), *_runs_off(view)]
     results += [_zigzag(view), overfits]
     return [finding for finding in results if finding is not None]
 
@@ -311,6 +313,18 @@ def _time_lost(view: LogView) -> Finding | None:
     values = {"best_lap_s": best_s, "theoretical_best_s": possible_s}
     values |= {f"lost_s, {name}": float(seconds) for name, seconds in lost.items()}
     return Finding("time_lost", sentence, values, {"worth_s": WORTH_S})
+
+
+def _costliest(view: LogView) -> Finding | None:
+    """Say which box or bot costs most of the crashes of the last third of the iterations."""
+    if view.others is None:
+        return None
+    late = thirds(view.steps["iteration"].to_numpy()) == 2
+    found = costliest(view.others, late)
+    if found is None:
+        return None
+    sentence, values = found
+    return Finding("costs_most", f"In the last third of the iterations: {sentence}", values)
 
 
 def _crashes(view: LogView) -> Finding | None:

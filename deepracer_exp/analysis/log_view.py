@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from deepracer_exp.aws.logs.recording import TRAINING, LogProblem, Recording
 from deepracer_exp.aws.models.hyperparameters import Hyperparameters
+from deepracer_exp.env.placement import box_corners_of
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.recording import RunRecording
 from deepracer_exp.tracks.track import Track
@@ -23,6 +24,7 @@ from .log_course import (
     numbered_as_logged,
     was_driven_on,
 )
+from .others import OthersOnRoad, others_on_road
 from .step_columns import add_derived, first_rows, timed_by_service
 from .tables import candidates, episode_table, iteration_table
 
@@ -70,8 +72,18 @@ class LogView:
     """Problems of the recording and of its courses."""
     discount: float
     """Factor on the reward of the next step, in `discounted_future_reward`."""
+    others: OthersOnRoad | None = None
+    """Boxes and bots around the cars of `steps`; None where nobody else was on the road, or where is not known."""
     run: RunRecording | None = None
     """The records that only a run of ours has; None for a log of the service."""
+
+    def boxes_of(self, episode: int) -> NDArray[np.float64]:
+        """Return the corners of the boxes of an episode of `steps`, (k, 4, 2); none where these are not known."""
+        run, course = self.run, self.course
+        if run is None or run.race is None or course is None:
+            return np.zeros((0, 4, 2))
+        placed = run.placed.get(course.reversed, {}).get(episode)
+        return np.zeros((0, 4, 2)) if placed is None else box_corners_of(run.race, course, placed[0])
 
     @property
     def stopping(self) -> Mapping[str, Any] | None:
@@ -253,8 +265,15 @@ def prepare(log: Recording | RunRecording, track: str | None = None) -> LogView:
         laps_timed=timed + races_timed,
         problems=(*recording.problems, *problems),
         discount=discount,
+        others=_others(run, trained, course),
         run=run,
     )
+
+
+def _others(run: RunRecording | None, steps: pd.DataFrame, course: Track | None) -> OthersOnRoad | None:
+    if run is None or run.race is None or course is None:
+        return None
+    return others_on_road(run.race, run.placed.get(course.reversed, {}), steps, course, run.period_s)
 
 
 def _episodes(

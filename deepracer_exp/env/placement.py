@@ -8,7 +8,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from deepracer_exp.config.race import LANES, BotsConfig, BoxesConfig, RaceConfig
-from deepracer_exp.sim.others import END_M, Others
+from deepracer_exp.sim.others import BOX_M, END_M, Others
+from deepracer_exp.sim.scenery import box_corners
 from deepracer_exp.tracks.lanes import Lanes
 from deepracer_exp.tracks.track import Track, Tracks
 
@@ -107,15 +108,28 @@ def placements_table(setup: RaceSetup, rows: NDArray[np.float64], extra: NDArray
     return pa.Table.from_pylist(written, schema=SCHEMA)
 
 
-def read_placements(table: pa.Table) -> dict[int, tuple[Placement, Floats]]:
-    """Return the placement of each episode of written tables, and when all bots stopped, s since the reset."""
-    episodes: dict[int, tuple[Placement, Floats]] = {}
+def read_placements(table: pa.Table) -> dict[bool, dict[int, tuple[Placement, Floats]]]:
+    """Return the placement of each episode of written tables, and when all bots stopped, s since the reset.
+
+    The keys are whether the track is driven reversed, and the episode's number.
+    """
+    by_way: dict[bool, dict[int, tuple[Placement, Floats]]] = {False: {}, True: {}}
     for row in table.to_pylist():
+        episodes = by_way[row["reversed"]]
         drawn, stopped_at_s = episodes.get(row["episode"], (None, np.zeros(0)))
         if drawn is None:
             drawn = Placement(np.array(row["places_m"]), np.array(row["lanes"], np.int64), row["seed"])
         episodes[row["episode"]] = drawn, np.append(stopped_at_s, row["bots_stopped_at_s"])
-    return episodes
+    return by_way
+
+
+def box_corners_of(race: RaceConfig, track: Track, drawn: Placement) -> Floats:
+    """Return the corners of the boxes of an episode, by the rectangle in which a corner of a car crashes, (k, 4, 2)."""
+    count = race.boxes.count
+    points = track.points_at(drawn.places_m[:count] / track.length_m)
+    pose = Lanes([track]).poses(points, drawn.lanes[:count], np.zeros(count, np.intp))
+    corners: Floats = box_corners(np.column_stack([*pose, *np.tile(BOX_M, (count, 1)).T])).astype(np.float64)
+    return corners
 
 
 def rebuild_poses(

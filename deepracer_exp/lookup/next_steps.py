@@ -61,7 +61,11 @@ def outcome(run: RunRecord) -> list[tuple[str, str]]:
         ]
         facts.append(("Best checkpoint", f"{result.iteration:06d}, by {result.criterion}"))
         with contextlib.suppress(BadInput):  # a page is written of a run whose metrics are damaged, too
-            if (lap := fastest_reliable(run.rows or read_metrics(run.path / METRICS))) is not None:
+            rows = run.rows or read_metrics(run.path / METRICS)
+            crash_free = [row.get("eval_crash_free") for row in rows if row["iteration"] == result.iteration]
+            if crash_free and crash_free[0] is not None:
+                facts.insert(2, ("Usual laps without a crash, %", f"{100 * crash_free[0]:.0f}"))
+            if (lap := fastest_reliable(rows)) is not None:
                 facts.append(("Fastest reliable lap", str(lap)))
     elif run.summary:
         facts.append(("Evaluated", "never"))

@@ -13,6 +13,7 @@ from deepracer_exp.analysis.charts import (
     driving_line,
     laps,
     mistakes,
+    others,
     rewards,
     training,
 )
@@ -58,6 +59,10 @@ SECTIONS: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
         driving_line.zigzag,
         *(driving_line.racing_line, driving_line.acceleration_map, driving_line.slide_map),
     ),
+    "What is on the road": (
+        *(others.crash_free, others.crashes_by_object, others.crash_places),
+        others.overtakes,
+    ),
     "Where it goes wrong": (mistakes.off_track_risk, mistakes.episode_ends_map, mistakes.visits_map),
     "What it does": (
         *(actions.action_use_by_section, actions.zero_steering_top_speed, actions.entropy_along_track),
@@ -80,7 +85,15 @@ RACES: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
 }
 """The figures of a recording without a training."""
 FIRST = (
-    *("replayed_laps", "lap_line", "training_progress", "evaluations", "lap_time_histogram"),
+    *(
+        "replayed_laps",
+        "lap_line",
+        "crash_free",
+        "crashes_by_object",
+        "training_progress",
+        "evaluations",
+        "lap_time_histogram",
+    ),
     *("sector_times", "speed_steering_by_waypoint", "off_track_risk", "racing_line", "reward_by_waypoint"),
 )
 """Names of the figures that matter most: those that were asked for, then the result, then where time is lost."""

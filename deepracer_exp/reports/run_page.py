@@ -4,10 +4,17 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import TypeAdapter
+
 from deepracer_exp.config.car import CarConfig
+from deepracer_exp.config.race import RaceConfig
+from deepracer_exp.env.placement import box_corners_of, read_placements
 from deepracer_exp.env.setup import Course
 from deepracer_exp.runs.files import BEST_LAP, LEARNING, METRICS, REPORT, TRACE, read_config, sees_pictures
-from deepracer_exp.runs.trace import read_trace
+from deepracer_exp.runs.trace import read_others, read_trace
+from deepracer_exp.tracks.track import Track
 
 logger = logging.getLogger("deepracer_exp")
 
@@ -25,8 +32,18 @@ def write_pictures(run_dir: Path, courses: Sequence[Course]) -> None:
         return
     trace = read_trace(run_dir / TRACE, LINE_COLUMNS)
     tracks = {course.name: course.tracks[0] for course in courses}
+    others = read_others(run_dir / TRACE)
+    boxes_of = None
+    if others is not None:
+        placed = read_placements(others)
+        race = TypeAdapter(RaceConfig).validate_python(read_config(run_dir)["race"])
+
+        def boxes_of(track: Track, episode: int) -> NDArray[np.float64]:
+            drawn = placed[track.reversed].get(episode)
+            return np.zeros((0, 4, 2)) if drawn is None else box_corners_of(race, track, drawn[0])
+
     curves = learning_curves(pd.read_json(metrics_file, lines=True))
-    for name, figure in ((BEST_LAP, driven_lines(trace, tracks)), (LEARNING, curves)):
+    for name, figure in ((BEST_LAP, driven_lines(trace, tracks, boxes_of)), (LEARNING, curves)):
         figure.set_dpi(120)
         # `savefig` draws a figure twice, the first time for its layout alone.
         FigureCanvasAgg(figure).print_png(run_dir / name)

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from deepracer_exp.aws.logs import sim_trace
@@ -27,14 +28,18 @@ from deepracer_exp.aws.logs.recording import (
 from deepracer_exp.aws.models.model_metadata import ModelMetadata
 from deepracer_exp.config.custom_files import SAC_TAKEN, TAKEN
 from deepracer_exp.config.driving import ActionSpaceConfig
+from deepracer_exp.config.race import RaceConfig
 from deepracer_exp.env.action_space import build_action_space, metadata_of
+from deepracer_exp.env.placement import Placement, read_placements
 from deepracer_exp.env.trace import EPISODE_STATUS, SCHEMA
 from deepracer_exp.errors import BadInput
 
 from .files import CONFIG, METRICS, REWARD, SUMMARY, TRACE, is_run, read_config, read_object
 from .result import IN_TRAINING, RunResult, read_result
-from .trace import trace_files
+from .trace import read_others, trace_files
 
+CONTROL_PERIOD_S = 1 / 15
+"""The service's simulated seconds of a control step."""
 EVALUATION_COLUMNS: Mapping[str, tuple[str, str]] = {
     "iteration": ("int32", "policy update after which the policy was evaluated, counted as in the steps"),
     "completion": ("float64", "per cent of the lap, mean over the trials"),
@@ -44,6 +49,10 @@ EVALUATION_COLUMNS: Mapping[str, tuple[str, str]] = {
     ),
     "lap_share": ("float64", "complete laps as a share of those tried; NaN where not known"),
     "lap_time_s": ("float64", "s, mean of the complete laps; NaN without one"),
+    "crash_free": (
+        "float64",
+        "complete laps without a crash as a share of those tried; NaN alone on the track",
+    ),
     "zigzag_per_m": ("float64", "changes of steering a metre of straight; NaN where not measured"),
     "zigzag_deg": ("float64", "degrees to either side in these changes; NaN without one"),
     "zigzag_lost_s": ("float64", "s a lap lost in these; NaN where not measured"),
@@ -52,6 +61,7 @@ EVALUATION_COLUMNS: Mapping[str, tuple[str, str]] = {
 
 _READ = [name for name in STEP_COLUMNS if name in SCHEMA.names]
 _SCHEMA = pa.schema([SCHEMA.field(name) for name in _READ])
+_RACE: TypeAdapter[RaceConfig] = TypeAdapter(RaceConfig)
 _ACTION_SPACE: TypeAdapter[ActionSpaceConfig] = TypeAdapter(ActionSpaceConfig)
 
 
@@ -69,6 +79,12 @@ class RunRecording:
     """The run's group `stopping`; None where its configuration cannot be read."""
     decision: Mapping[str, Any] | None = None
     """The decision of the stopping rule that ended the run, as in summary.json; None if no rule did."""
+    race: RaceConfig | None = None
+    """The boxes and bots of the run; None where the car was alone or the configuration cannot be read."""
+    placed: Mapping[bool, Mapping[int, tuple[Placement, NDArray[np.float64]]]] = field(default_factory=dict)
+    """Where these were in each episode (`env.placement.read_placements`), by whether the track was driven reversed."""
+    period_s: float = CONTROL_PERIOD_S
+    """Simulated seconds of a control step."""
 
 
 def is_traced_run(folder: Path) -> bool:
@@ -125,6 +141,7 @@ def read_run_recording(folder: Path) -> RunRecording:
         evaluations=evaluated,
         stopping=config.get("stopping"),
         decision=_decision(folder),
+        **_others(folder, config, problems),
     )
 
 
@@ -201,6 +218,21 @@ def _metrics(
         if np.isfinite(tried["completion"]):
             evaluated.append({"iteration": iteration, **tried})
     return typed_table(UPDATE_COLUMNS, updates), typed_table(EVALUATION_COLUMNS, evaluated)
+
+
+def _others(folder: Path, config: Mapping[str, Any], problems: list[LogProblem]) -> dict[str, Any]:
+    """Return `race`, `placed` and `period_s` of a run among boxes or bots, nothing of another."""
+    if config.get("race") is None:
+        return {}
+    try:
+        race = _RACE.validate_python(config["race"])
+        table = read_others(folder / TRACE)
+    except (BadInput, ValidationError) as error:
+        problems.append(LogProblem(str(folder), None, f"without boxes and bots: {_one_line(error)}"))
+        return {}
+    if table is None:
+        return {}
+    return {"race": race, "placed": read_placements(table), "period_s": 1 / config["car"]["control_hz"]}
 
 
 def _decision(folder: Path) -> Mapping[str, Any] | None:

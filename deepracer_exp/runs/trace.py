@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from deepracer_exp.env.placement import SCHEMA as OTHERS_SCHEMA
 from deepracer_exp.env.trace import SCHEMA, TRACE_COLUMNS
 from deepracer_exp.errors import BadInput, RunFailed
 
@@ -73,6 +74,26 @@ def trace_files(folder: Path) -> list[Path]:
     if not files:
         raise BadInput(folder, f"no *{_ENDING}", "the folder of a run with its trace")
     return files
+
+
+def read_others(folder: Path, least_iteration: int = 0) -> pa.Table | None:
+    """Read where the boxes and bots of a trace were, `env.placement.SCHEMA`; None where nobody else was on the road.
+
+    Raises:
+        BadInput: a file is incomplete or of another kind.
+    """
+    tables = []
+    for path in sorted(folder.glob(f"*{_OTHERS_ENDING}")):
+        if path.name.startswith(".") or int(path.name.partition("-")[0]) < least_iteration:
+            continue
+        try:
+            tables.append(pq.read_table(path).cast(OTHERS_SCHEMA))
+        except (OSError, pa.ArrowInvalid, ValueError) as error:
+            reason = " ".join(str(error).split())
+            raise BadInput(
+                path, f"not where the others were ({reason})", "a complete Parquet file of a run"
+            ) from error
+    return pa.concat_tables(tables) if tables else None
 
 
 def rewind_trace(folder: Path, iteration: int) -> None:

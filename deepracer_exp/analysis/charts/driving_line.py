@@ -13,7 +13,7 @@ from deepracer_exp.analysis.zigzag import CENTRED_DEG, zigzag_in_words, zigzag_n
 from deepracer_exp.errors import count
 
 from .figure import Chart, Layer, Panel, band, bars, color_range, colored_points, line, note, points
-from .maps import LEAST_STEPS, Grid, beside, map_panel, waypoint_panel
+from .maps import LEAST_STEPS, Grid, beside, map_panel, outlines, waypoint_panel
 from .runs import run_folder
 from .style import BLUE, CATEGORIES, INK, ORANGE, PALE, VERMILION
 
@@ -48,6 +48,8 @@ def lap_line(view: LogView) -> Chart | None:
         hover=hover,
     )
     mean_mps = view.course.length_m / float(row["lap_time_s"])
+    boxes = view.boxes_of(int(row["episode"]))
+    around = [outlines(boxes, VERMILION, width=2.0)] if len(boxes) else []
     whose = f"iteration {row['iteration']}" if view.trained else str(row["stream"])
     kind = "exploring lap" if view.trained else "lap"
     return Chart(
@@ -55,8 +57,10 @@ def lap_line(view: LogView) -> Chart | None:
         title=f"The fastest {kind}: {row['lap_time_s']:.3f} s, {whose}, episode {row['episode']}",
         caption="One dot for each control step of the fastest complete lap, coloured by the speed of the car; "
         f"at a constant {mean_mps:.2f} m/s the centre line would take as long. Dots close together are slow: find "
-        "where the car slows down and ask whether the bend requires it.",
-        rows=[[map_panel(view.course, [line(lap["X"], lap["Y"], PALE, width=1.25), dots])]],
+        "where the car slows down and ask whether the bend requires it."
+        + " The outlines are the boxes of this episode."
+        * bool(around),
+        rows=[[map_panel(view.course, [line(lap["X"], lap["Y"], PALE, width=1.25), *around, dots])]],
     )
 
 

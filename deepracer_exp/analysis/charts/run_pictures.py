@@ -1,7 +1,7 @@
 """The two pictures of every run, best_lap.png and learning.png: its driven lines and its learning curves."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import matplotlib
@@ -61,10 +61,15 @@ def episodes(trace: pd.DataFrame) -> pd.DataFrame:
     return table.drop(columns=["first_step", "last_step", "start_s", "end_s"])
 
 
-def driven_lines(trace: pd.DataFrame, tracks: Mapping[str, Track]) -> Figure:
+def driven_lines(
+    trace: pd.DataFrame,
+    tracks: Mapping[str, Track],
+    boxes_of: Callable[[Track, int], NDArray[np.float64]] | None = None,
+) -> Figure:
     """Draw the best episode of each track of a trace: its fastest complete lap, or the episode that drove farthest.
 
-    Lines are coloured by measured speed, on one scale; a track that was not driven on is shown empty.
+    Lines are coloured by measured speed, on one scale; a track that was not driven on is shown empty. `boxes_of`
+    returns the corners of an episode's boxes on a track, (k, 4, 2); None: there are none.
     """
     shown = []
     for name, track in tracks.items():
@@ -83,7 +88,9 @@ def driven_lines(trace: pd.DataFrame, tracks: Mapping[str, Track]) -> Figure:
                 f"  ·  {track.length_m:.2f} m, mean {speed_mps.mean():.2f} m/s, top {speed_mps.max():.2f} m/s"
             )
             words += f"  ·  iteration {table['iteration'][best]}, episode {best}, car {table['car'][best]}"
-        shown.append(TrackLines(track, words, (driven[["X", "Y", "speed_mps"]].to_numpy(np.float64),)))
+        boxes = np.zeros((0, 4, 2)) if boxes_of is None else boxes_of(track, int(best))
+        lines = (driven[["X", "Y", "speed_mps"]].to_numpy(np.float64),)
+        shown.append(TrackLines(track, words, lines, boxes))
     return lines_figure(shown)
 
 

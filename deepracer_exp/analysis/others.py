@@ -1,0 +1,177 @@
+"""Boxes and bots around the cars of a log: where they were, which of them was run into, and which was passed."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from deepracer_exp.config.race import RaceConfig
+from deepracer_exp.env.placement import Placement, box_corners_of, rebuild_poses
+from deepracer_exp.sim.others import BOX_M, CAR_M, first_hit
+from deepracer_exp.tracks.track import Track
+
+from .statistics import Values, wilson
+
+ORIGIN_BEHIND_M = 0.14
+"""Distance from the logged point, the front of the car, back to its origin (deepracer-simapp)."""
+NEAR_M = 2.0
+"""Gap along the lap below which a car that gets past something has passed it, not jumped."""
+_EPISODES = 2000
+"""Episodes whose poses are rebuilt together: 100 MB with six others."""
+
+PlacedEpisodes = Mapping[int, tuple[Placement, Values]]
+"""By number of the episode: the placement, and when all bots stopped, s since the reset."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OthersOnRoad:
+    """The others of a log's episodes, as far as their places are known."""
+
+    names: tuple[str, ...]
+    """`box 1`, ..., `bot 1`, ...: boxes and then bots, each in the order of the lap; (K,)."""
+    boxes: int
+    """How many of them are boxes."""
+    corners: NDArray[np.float64]
+    """Corners of the boxes that stand at the same places in every episode, (boxes, 4, 2); (0, 4, 2) where they do
+    not."""
+    lap_share: Values
+    """Where these stand, as shares of the lap, (boxes,); empty where they do not."""
+    crashes: pd.DataFrame
+    """One row for each crash: `row` of the steps and `other`, its index."""
+    passes: pd.DataFrame
+    """One row each time that one fell behind a car (`overtaken`) or came past it from behind: `row`, `other`."""
+
+    @property
+    def bots(self) -> int:
+        """Return how many of the others are bots."""
+        return len(self.names) - self.boxes
+
+    def table(self, rows: NDArray[np.bool_] | None = None) -> pd.DataFrame:
+        """Return crashes and passes of each of the others, (K,): `crashes`, `passed`, `risk` of a crash in a meeting.
+
+        `rows` are the rows of the steps that count; None: all.
+        """
+        crashed, passed = self.crashes, self.passes[self.passes["overtaken"]]
+        if rows is not None:
+            crashed, passed = crashed[rows[crashed["row"]]], passed[rows[passed["row"]]]
+        crashes, over = (
+            np.bincount(some["other"], minlength=len(self.names)).astype(np.int64)
+            for some in (crashed, passed)
+        )
+        risk = crashes / np.maximum(crashes + over, 1)
+        return pd.DataFrame({"crashes": crashes, "passed": over, "risk": risk}, index=list(self.names))
+
+
+def others_on_road(
+    race: RaceConfig, placed: PlacedEpisodes, steps: pd.DataFrame, course: Track, period_s: float
+) -> OthersOnRoad | None:
+    """Return the others around the cars of a log; None if no episode's are known.
+
+    Args:
+        race: among whom the cars drove.
+        placed: the episodes whose others are known; those on the course in its direction.
+        steps: rows by episode and time with `X`, `Y`, `yaw`, `steps` and `episode_status`.
+        course: that was driven on.
+        period_s: simulated seconds of a control step.
+    """
+    number = steps["episode"].to_numpy()
+    first = np.flatnonzero(np.diff(number, prepend=-1) != 0)
+    ends = np.append(first[1:], len(steps))
+    known = [place for place, episode in enumerate(number[first].tolist()) if episode in placed]
+    if not known:
+        return None
+    crashes: list[pd.DataFrame] = []
+    passes: list[pd.DataFrame] = []
+    for begin in range(0, len(known), _EPISODES):
+        some = known[begin : begin + _EPISODES]
+        rows = np.concatenate([np.arange(first[place], ends[place]) for place in some])
+        of_episode = np.repeat(np.arange(len(some)), [ends[place] - first[place] for place in some])
+        placements = [placed[int(number[first[place]])] for place in some]
+        found = _met(race, placements, steps.iloc[rows], of_episode, course, period_s)
+        for table, collected in zip(found, (crashes, passes), strict=True):
+            collected.append(table.assign(row=rows[table["row"]]))
+    boxes = race.boxes.count
+    corners, lap_share = np.zeros((0, 4, 2)), np.zeros(0)
+    every = np.stack([placed[int(number[first[place]])][0].places_m[:boxes] for place in known])
+    lanes = np.stack([placed[int(number[first[place]])][0].lanes[:boxes] for place in known])
+    if boxes and np.ptp(every, axis=0).max() < 1e-6 and not np.ptp(lanes, axis=0).any():
+        lap_share = every[0] / course.length_m
+        corners = box_corners_of(race, course, placed[int(number[first[known[0]]])][0])
+    names = [f"box {one}" for one in range(1, boxes + 1)]
+    names += [f"bot {one}" for one in range(1, race.bots.count + 1)]
+    return OthersOnRoad(
+        names=tuple(names),
+        boxes=boxes,
+        corners=corners,
+        lap_share=lap_share,
+        crashes=pd.concat(crashes, ignore_index=True),
+        passes=pd.concat(passes, ignore_index=True),
+    )
+
+
+def _met(
+    race: RaceConfig,
+    placements: list[tuple[Placement, Values]],
+    steps: pd.DataFrame,
+    of_episode: NDArray[np.intp],
+    course: Track,
+    period_s: float,
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return crashes and passes of some episodes; `row` counts the rows of `steps`."""
+    step = steps["steps"].to_numpy(np.int64)
+    poses, distance_m = rebuild_poses(race, course, placements, period_s, of_episode, step)
+    x, y, yaw_rad = (steps[name].to_numpy(np.float64) for name in ("X", "Y", "yaw"))
+    yaw_rad = np.radians(yaw_rad)
+    status = steps["episode_status"].astype(str).to_numpy()
+    begins = np.append(True, np.diff(of_episode) != 0)
+    crashed = np.flatnonzero((status == "crashed") & (begins | (np.append([""], status[:-1]) != "crashed")))
+    # A crash is judged by where the bots were a step before.
+    lagged = poses[np.where(begins[crashed], crashed, crashed - 1)]
+    origin = (
+        x[crashed] - ORIGIN_BEHIND_M * np.cos(yaw_rad[crashed]),
+        (y[crashed] - ORIGIN_BEHIND_M * np.sin(yaw_rad[crashed])),
+    )
+    is_bot = np.arange(race.others) >= race.boxes.count
+    half_m = 0.5 * np.where(is_bot[:, None], CAR_M, BOX_M)
+    hit = np.asarray(first_hit(*origin, yaw_rad[crashed], lagged, half_m))
+    away_m = np.hypot(lagged[..., 0] - origin[0][:, None], lagged[..., 1] - origin[1][:, None])
+    hit = np.where(hit >= 0, hit, away_m.argmin(axis=1))
+    length_m = course.length_m
+    at_m = course.project(np.column_stack([x, y])).distance_m
+    gap_m = np.mod(distance_m - at_m[:, None] + 0.5 * length_m, length_m) - 0.5 * length_m
+    near = (np.abs(gap_m[1:]) < NEAR_M) & (np.abs(gap_m[:-1]) < NEAR_M) & ~begins[1:, None]
+    changed = near & ((gap_m[1:] > 0) != (gap_m[:-1] > 0))
+    row, other = np.nonzero(changed)
+    return (
+        pd.DataFrame({"row": crashed, "other": hit}),
+        pd.DataFrame({"row": row + 1, "other": other, "overtaken": gap_m[row + 1, other] <= 0}),
+    )
+
+
+def costliest(
+    others: OthersOnRoad, rows: NDArray[np.bool_]
+) -> tuple[str, dict[str, float | int | str]] | None:
+    """Return a sentence on which box or bot costs most of the crashes, and its numbers; None without a crash.
+
+    `rows` are the rows of the steps that count.
+    """
+    table = others.table(rows)
+    crashes = int(table["crashes"].sum())
+    if not crashes:
+        return None
+    worst = int(table["crashes"].to_numpy().argmax())
+    name, row = others.names[worst], table.iloc[worst]
+    met = int(row["crashes"] + row["passed"])
+    low, high = map(float, wilson(int(row["crashes"]), met))
+    where = f" (at {100 * others.lap_share[worst]:.0f}% of the lap)" if worst < len(others.lap_share) else ""
+    sentence = (
+        f"{name[0].upper()}{name[1:]}{where} costs most: {int(row['crashes'])} of {crashes} crashes, a crash in "
+        f"{row['risk']:.0%} of the {met:,} times the car came to it ({low:.0%} to {high:.0%} with 95% confidence)."
+    )
+    if others.bots:
+        overtaken = int(table["passed"].iloc[others.boxes :].sum())
+        sentence += f" It overtook bots {overtaken:,} times."
+    values: dict[str, float | int | str] = {"costs_most": name, "crashes": int(row["crashes"]), "met": met}
+    return sentence, values | {"all_crashes": crashes, "risk": float(row["risk"])}
