@@ -389,9 +389,6 @@ class Race:
             ("tstamp", rules.clock_steps * self._period_s),
             ("episode_status", result.status),
             ("speed_mps", now.speed_mps),
-            ("yaw_rate_radps", now.yaw_rate_radps),
-            ("offset_m", now.offset_m),
-            ("heading_error_rad", now.heading_error_rad),
             ("episode_return", self._return),
         ):
             row[:, PACKED[name]] = values

@@ -64,20 +64,21 @@ _COLUMNS: tuple[tuple[str, pa.DataType, str], ...] = (
     ("track", _TRACK, "name of the course"),
     ("iteration", pa.int32(), "policy update that used the row, from 1"),
     ("speed_mps", pa.float32(), "m/s measured"),
-    ("yaw_rate_radps", pa.float32(), "rad/s measured, positive to the left"),
-    ("offset_m", pa.float32(), "m from the centre line, positive to the left of the driving direction"),
-    ("heading_error_rad", pa.float32(), "rad from the centre line's direction, positive to the left"),
-    ("episode_return", pa.float64(), "sum of the episode's rewards up to here"),
     *((name, pa.float32(), unit) for name, unit in RANDOMIZED.items()),
 )
 TRACE_COLUMNS = tuple(name for name, _, _ in _COLUMNS)
 """Columns of a written trace."""
-PACKED_COLUMNS = tuple(
-    name for name in TRACE_COLUMNS if name not in ("pause_duration", "obstacle_crash_counter", "iteration")
+PACKED_COLUMNS = (
+    *(
+        name
+        for name in TRACE_COLUMNS
+        if name not in ("pause_duration", "obstacle_crash_counter", "iteration")
+    ),
+    "episode_return",
 )
 """Columns of packed rows, the float64 matrix in which a trace is passed between processes; booleans are 0 or 1,
-`episode_status` is its code, `track` the course's index in the experiment, and `action` is NaN for a continuous
-action space."""
+`episode_status` is its code, `track` the course's index in the experiment, `action` is NaN for a continuous action
+space, and `episode_return` the sum of the episode's rewards up to here."""
 PACKED = {name: place for place, name in enumerate(PACKED_COLUMNS)}
 """Column number of each packed column."""
 OTHERS_PACKED = ("own_episode", "bots_stopped")

@@ -164,7 +164,7 @@ def test_an_alternating_car_looks_and_is_paid_along_its_direction(setup_of, spy,
         assert {params["is_reversed"] for params in seen} == {episode % 2 == 1}
         progress = [params["progress"] for params in seen]
         assert progress[-1] > progress[0] + 2
-        assert abs(race.trace[0, PACKED["heading_error_rad"]]) < 0.5
+        assert abs(race.rules.now.heading_error_rad[0]) < 0.5
 
 
 # --- Gymnasium

@@ -85,9 +85,8 @@ def test_a_row_belongs_to_the_pose_its_action_was_chosen_at(race_of, column):
         seen, pose = race.observation.copy(), race.rules.now
         race.step(action)
         np.testing.assert_array_equal(column(race, "X"), pose.front[:, 0])
-        np.testing.assert_allclose(
-            column(race, "heading_error_rad"), np.arctan2(seen[:, 1], seen[:, 2]), atol=1e-6
-        )
+        np.testing.assert_allclose(pose.heading_error_rad, np.arctan2(seen[:, 1], seen[:, 2]), atol=1e-6)
+        np.testing.assert_array_equal(column(race, "yaw"), np.degrees(pose.yaw_rad))
         np.testing.assert_allclose(column(race, "steer"), 30 * action[:, 0])
     assert (race.observation[:, 3] != seen[:, 3]).all()
 
