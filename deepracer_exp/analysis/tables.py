@@ -237,7 +237,7 @@ def _evaluation_rows(recording: Recording) -> pd.DataFrame:
 
 
 def candidates(recording: Recording, iterations: pd.DataFrame) -> pd.DataFrame:
-    """Return the checkpoints of the service worth submitting, the best first, at most `MOST_CANDIDATES`.
+    """Return up to `MOST_CANDIDATES` checkpoints of the service worth submitting, the best first; `CANDIDATE_COLUMNS`.
 
     Evaluations decide where they completed a lap: they race the policy that is submitted, while a training draws its
     actions. The largest share of complete laps is first, then the lowest mean lap time. Otherwise the training's own
@@ -247,9 +247,6 @@ def candidates(recording: Recording, iterations: pd.DataFrame) -> pd.DataFrame:
 
     A policy that no update of this training has changed is none of its results: what drove iteration 0 is a network
     that has learned nothing, or the model that was cloned.
-
-    Returns:
-        `CANDIDATE_COLUMNS`.
     """
     rows = _evaluation_rows(recording)
     groups = rows.assign(time_s=rows["time_s"].where(rows["lap"])).groupby("iteration")

@@ -34,7 +34,7 @@ def import_files(
     source: str | None = None,
     typed: Mapping[str, str] | None = None,
 ) -> list[Path]:
-    """Write `./conf/GROUP/NAME.yaml` for each file and `./conf/experiment/NAME.yaml` for all of them.
+    """Write and return `./conf/GROUP/NAME.yaml` for each file and, last, `./conf/experiment/NAME.yaml` for all of them.
 
     Several tracks are left out, because no option file can choose them (`job_overrides.several_of`).
 
@@ -45,9 +45,6 @@ def import_files(
         more: overrides that belong to the experiment, too.
         source: where the files come from, if their folder is a temporary one.
         typed: the user's own overrides by key or group, in whose place none is written.
-
-    Returns:
-        The files written, the experiment's last.
 
     Raises:
         BadInput: the name cannot be used or is taken, or a file cannot be written; then none is.

@@ -139,12 +139,9 @@ class OptionFolders(SearchPathPlugin):
 
 
 def composed(entry: str | None, lines: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
-    """Let Hydra compose a file of `conf/`, or options alone.
+    """Let Hydra compose a file of `conf/`, or options alone; return the values, and the option chosen in each group.
 
     `entry` is the name of a file, or None; the lines choose an option of a group each, in Hydra's grammar.
-
-    Returns:
-        The values, without Hydra's own settings; the option chosen in each group.
 
     Raises:
         BadInput: an option that another one names is not there, or a file cannot be used.

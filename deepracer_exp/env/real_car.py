@@ -141,7 +141,7 @@ class Servos:
 
 
 def car_pictures(frames: NDArray[np.uint8], jpeg_quality: int | None) -> NDArray[np.uint8]:
-    """Return the pictures that the car makes of its camera's frames for a model.
+    """Return the pictures that the car makes of its camera's frames for a model, (n, channels, height, width).
 
     The car compresses in colour and turns grey last; here it is the other way round: JPEG stores brightness separately,
     with the same weights of red, green and blue, so that the difference is rounding.
@@ -149,9 +149,6 @@ def car_pictures(frames: NDArray[np.uint8], jpeg_quality: int | None) -> NDArray
     Args:
         frames: grey, (n, channels, FRAME_SCALE * height, FRAME_SCALE * width).
         jpeg_quality: None: not compressed.
-
-    Returns:
-        (n, channels, height, width).
     """
     # cv::resize, bilinear: between pixels 1 and 2 of each 4 by 4; the others are not used.
     rows = frames[..., 1::FRAME_SCALE, :].astype(np.uint16) + frames[..., 2::FRAME_SCALE, :]

@@ -24,12 +24,9 @@ _log = logging.getLogger(__name__)
 
 
 def deliver(run_dir: Path, uri: str | None, runs_dir: Path) -> int:
-    """Record in MLflow what it lacks of a finished run, and mark the run as ended.
+    """Record in MLflow what it lacks of an ended run and mark it as ended; return the number of missing metric points.
 
     `uri` is the store, as in `tracking.uri` with its password; None: the one in `runs_dir`.
-
-    Returns:
-        The number of missing metric points.
 
     Raises:
         BadInput: a file is missing, the run has not ended, or MLflow refuses (the run was deleted there).

@@ -34,11 +34,7 @@ CENTER_COLOR = "#f5a623"
 
 
 def draw_terminal(track: Track, columns: int, rows: int) -> str:
-    """Draw the course in braille: borders, start line and an arrow in driving direction.
-
-    Returns:
-        Lines without trailing blanks, joined by newlines.
-    """
+    """Return a drawing of the course in braille: borders, start line and an arrow in driving direction."""
     outline = Outline.of(track)
     low, high = outline.corners()
     # A character is about twice as high as wide, so that braille dots are square.

@@ -255,13 +255,10 @@ class Ranking:
         self._episodes = np.zeros(len(lengths_m), np.int64)
 
     def rank(self, finished: Finished) -> tuple[float, float] | None:
-        """Return completion (per cent) and speed along the lap (m/s), means over tracks; higher is better.
+        """Return completion (per cent) and speed along the lap (m/s), means over tracks; None: too few episodes.
 
         Completion is the mean over a track's episodes, speed the track's length over the mean time of complete laps,
         0 where there is none.
-
-        Returns:
-            None as long as too few episodes have ended, or if none did in this iteration.
         """
         for track in np.unique(finished.track):
             here = finished.track == track

@@ -74,7 +74,7 @@ def run_training(
     tags: Mapping[str, str] = MappingProxyType({}),
     created: Callable[[Path], None] | None = None,
 ) -> TrainResult:
-    """Train what was planned: a new run, a clone, or the rest of a run from its last checkpoint.
+    """Train what was planned, a new run, a clone, or a run from its last checkpoint on; return how it ended.
 
     Args:
         plan: of `plan_training`, `plan_clone` or `plan_resume`.
@@ -83,9 +83,6 @@ def run_training(
         run_name: of the run in MLflow; None: from the reward function and the time.
         tags: of the run in MLflow, beside its own.
         created: called with the folder of a new run before it is recorded anywhere else.
-
-    Returns:
-        How it ended; `reason` holds a failed run's error.
 
     Raises:
         BadInput: before anything was started; no folder of a new run is left. A run cannot be resumed while it is
