@@ -52,6 +52,7 @@ from deepracer_exp.tracking.metrics import now_ms
 from deepracer_exp.tracking.tracking_file import TrackedRun, begin_again, read_tracked_run
 
 from .budget import refuse_spent
+from .callback import Callback, TakenOver, TrainResult
 from .callbacks import standard_callbacks
 from .clone import describe_clone, read_parent
 from .kept_policy import keep_policy
@@ -61,7 +62,7 @@ from .plan import ResumePlan, TrainPlan
 from .rivals import kept_rival
 from .signals import Interruption
 from .teacher import check_teacher
-from .trainer import Callback, TakenOver, Trainer, TrainResult
+from .trainer import Trainer
 
 logger = logging.getLogger("deepracer_exp")
 

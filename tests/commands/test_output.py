@@ -8,7 +8,7 @@ import pytest
 from deepracer_exp.commands.output import print_result, print_steps, print_unsent
 from deepracer_exp.config.running import MLflowTracking
 from deepracer_exp.runs.result import Ending
-from deepracer_exp.training.trainer import TrainResult
+from deepracer_exp.training.callback import TrainResult
 
 
 @pytest.mark.parametrize(("columns", "lines"), [(80, 2), (46, 4)])

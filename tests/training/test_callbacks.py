@@ -8,9 +8,9 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.runs.files import read_metrics
 from deepracer_exp.runs.folder import RunFolder, is_held
 from deepracer_exp.runs.result import STOPPED_EARLY
+from deepracer_exp.training.callback import Callback, TakenOver
 from deepracer_exp.training.plan import plan_resume, plan_training
 from deepracer_exp.training.run import copy_run, run_training
-from deepracer_exp.training.trainer import Callback, TakenOver
 
 from .conftest import assert_same_run
 

@@ -24,6 +24,7 @@ from optuna.trial import TrialState
 from sqlalchemy.exc import DBAPIError, IntegrityError
 
 from deepracer_exp.sweeps.trial import SeedRun, Trial, as_runs, runs_as_json
+from deepracer_exp.training.callback import TakenOver
 
 from .storage import DOWN, patiently
 
@@ -302,8 +303,6 @@ class Lease:
         if not self._lost and time.monotonic() > self._renewed_at + self._lease_s / 2:
             self._lost = not patiently(self._renew, self._patience_s)
         if self._lost:
-            from deepracer_exp.training.trainer import TakenOver  # which imports torch
-
             raise TakenOver(f"trial {self.claim.trial.number} was taken over")
 
     def held(self, write: Callable[[], bool]) -> None:

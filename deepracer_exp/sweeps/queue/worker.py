@@ -39,10 +39,11 @@ from deepracer_exp.tracking.metrics import trial_metrics
 from deepracer_exp.tracking.study_run import TRIAL, end_trial_run, open_trial_run
 from deepracer_exp.tracking.tracking_file import Status
 from deepracer_exp.training.budget import RunEnded
+from deepracer_exp.training.callback import Callback, TakenOver, TrainResult
 from deepracer_exp.training.plan import TrainPlan, plan_resume
 from deepracer_exp.training.run import copy_run, run_training
 from deepracer_exp.training.signals import Interruption
-from deepracer_exp.training.trainer import Callback, TakenOver, Trainer, TrainResult
+from deepracer_exp.training.trainer import Trainer
 
 from .claims import Claim, Lease, TrialClaims, report_results
 from .storage import patiently, resolve_database
