@@ -129,8 +129,8 @@ def lap_statistics(evaluation: Evaluation, metric: Metric) -> LapStatistics:
     def time_s(percent: int, condition: str = USUAL) -> float:
         groups = [group for group in evaluation.groups if group.condition == condition]
         times = [group.lap_times_s for group in groups]
-        found = [np.percentile(some, percent) if len(some) else math.nan for some in times]
-        return float(np.mean(found)) if found else math.nan
+        times_s = [np.percentile(some, percent) if len(some) else math.nan for some in times]
+        return float(np.mean(times_s)) if times_s else math.nan
 
     return LapStatistics(
         complete=100 * share["mean"],
@@ -154,11 +154,11 @@ def recommend(results: Sequence[CheckpointResult], metric: Metric) -> tuple[str,
 
     On the trials of the training it is the run's own `best`. Ties go to the oldest, as in the training.
     """
-    driven = [(one, one.figures) for one in results if one.figures is not None]
+    driven = [(result, result.figures) for result in results if result.figures is not None]
     if not driven:
         return None
-    (best, found), *others = sorted(driven, key=lambda pair: pair[1].rank, reverse=True)
-    why = f"best by {CRITERIA[metric]}: {_words(found)}"
+    (best, statistics), *others = sorted(driven, key=lambda pair: pair[1].rank, reverse=True)
+    why = f"best by {CRITERIA[metric]}: {_words(statistics)}"
     if others:
         why += f"; next is {others[0][0].name}: {_words(others[0][1])}"
     for marked, of_marked in driven:
@@ -167,11 +167,13 @@ def recommend(results: Sequence[CheckpointResult], metric: Metric) -> tuple[str,
     return best.name, why
 
 
-def _words(found: LapStatistics) -> str:
-    name = BOTH if math.isfinite(found.held_out_completion) else "race score (usual)"
-    score = "no complete lap" if found.race_score_s is None else f"{name} {found.race_score_s:.2f} s"
-    lap = "" if math.isnan(found.median_s) else f", median usual lap {found.median_s:.2f} s"
-    return f"{score}, usual completion {found.completion:.1f}%{lap}"
+def _words(statistics: LapStatistics) -> str:
+    name = BOTH if math.isfinite(statistics.held_out_completion) else "race score (usual)"
+    score = (
+        "no complete lap" if statistics.race_score_s is None else f"{name} {statistics.race_score_s:.2f} s"
+    )
+    lap = "" if math.isnan(statistics.median_s) else f", median usual lap {statistics.median_s:.2f} s"
+    return f"{score}, usual completion {statistics.completion:.1f}%{lap}"
 
 
 def comparison_table(results: Sequence[CheckpointResult], chosen: str, console: Console) -> Table:
@@ -184,41 +186,43 @@ def comparison_table(results: Sequence[CheckpointResult], chosen: str, console: 
             shown.add_column(
                 name, no_wrap=True, justify="left" if name in ("checkpoint", _LABELS) else "right"
             )
-        for one in results:
-            cells = _cells(one, intervals)
-            style = "bold green" if one.name == chosen else "dim" if one.figures is None else ""
-            shown.add_row(one.name, *(cells[name] for name in names), style=style)
+        for result in results:
+            cells = _cells(result, intervals)
+            style = "bold green" if result.name == chosen else "dim" if result.figures is None else ""
+            shown.add_row(result.name, *(cells[name] for name in names), style=style)
         return shown
 
     return fit(console, lay_out, () if _has_held_out(results) else (_HELD_OUT,), _MINOR)
 
 
 def _has_held_out(results: Sequence[CheckpointResult]) -> bool:
-    return any(one.figures is not None and math.isfinite(one.figures.held_out_completion) for one in results)
+    return any(
+        result.figures is not None and math.isfinite(result.figures.held_out_completion) for result in results
+    )
 
 
-def _labels(one: CheckpointResult) -> list[str]:
-    return [*one.labels, *["pinned"] * bool(one.pinned), *["bad"] * (one.figures is None)]
+def _labels(result: CheckpointResult) -> list[str]:
+    return [*result.labels, *["pinned"] * bool(result.pinned), *["bad"] * (result.figures is None)]
 
 
-def _cells(one: CheckpointResult, intervals: bool) -> dict[str, str]:
+def _cells(result: CheckpointResult, intervals: bool) -> dict[str, str]:
     """Return a checkpoint's cells by column."""
-    labels, found = _labels(one), one.figures
-    if found is None:
+    labels, figures = _labels(result), result.figures
+    if figures is None:
         return {name: NOTHING for name in _NAMES} | {_LABELS: ", ".join(labels)}
-    share = f"{found.complete:.0f}"
-    if intervals and found.low < found.high:
-        share += f" ({found.low:.0f}\N{EN DASH}{found.high:.0f})"
+    share = f"{figures.complete:.0f}"
+    if intervals and figures.low < figures.high:
+        share += f" ({figures.low:.0f}\N{EN DASH}{figures.high:.0f})"
     return {
-        "steps": f"{one.env_steps:,}",
+        "steps": f"{result.env_steps:,}",
         _LABELS: ", ".join(labels),
         "laps %": share,
-        "done %": number(found.completion, 1),
-        _HELD_OUT: number(found.held_out_completion, 1),
-        "p25 s": number(found.lap_time_s, 2),
-        "median": number(found.median_s, 2),
-        "best": number(found.best_s, 2),
-        "score s": number(found.race_score_s, 2),
+        "done %": number(figures.completion, 1),
+        _HELD_OUT: number(figures.held_out_completion, 1),
+        "p25 s": number(figures.lap_time_s, 2),
+        "median": number(figures.median_s, 2),
+        "best": number(figures.best_s, 2),
+        "score s": number(figures.race_score_s, 2),
     }
 
 
@@ -227,8 +231,8 @@ def _page_table(results: Sequence[CheckpointResult]) -> PageTable:
     names = [name for name in _NAMES if name != _HELD_OUT or _has_held_out(results)]
     # Words before numbers.
     order = [_LABELS, *(name for name in names if name != _LABELS)]
-    cells = [(one.name, _cells(one, intervals=True)) for one in results]
-    rows = tuple((name, *(found[column] for column in order)) for name, found in cells)
+    cells = [(result.name, _cells(result, intervals=True)) for result in results]
+    rows = tuple((name, *(columns[column] for column in order)) for name, columns in cells)
     return PageTable(("checkpoint", *(name.replace("\n", " ") for name in order)), rows, 2)
 
 
@@ -262,28 +266,28 @@ def show_checkpoints(
         soft_wrap=True,
     )
     with err.status("") as status:
-        found = list(compare_checkpoints(run, evaluator, lambda name: status.update(f"{name} drives")))
-    chosen = recommend(found, run.experiment.checkpoints.metric)
+        results = list(compare_checkpoints(run, evaluator, lambda name: status.update(f"{name} drives")))
+    chosen = recommend(results, run.experiment.checkpoints.metric)
     if chosen is None:
-        raise BadInput(f"{found[-1].fault}; no checkpoint in {run.checkpoints} can be used")
+        raise BadInput(f"{results[-1].fault}; no checkpoint in {run.checkpoints} can be used")
     best, why = chosen
     # Lines are wrapped for a terminal, but not for a pipe, whose lines are searched.
     whole = not out.is_terminal
-    out.print(comparison_table(found, best, out))
-    held_out = ["held-out done: the same on held-out conditions"] * _has_held_out(found)
+    out.print(comparison_table(results, best, out))
+    held_out = ["held-out done: the same on held-out conditions"] * _has_held_out(results)
     out.print("; ".join([*_LEGEND[:2], *held_out, *_LEGEND[2:]]), "", style="dim", soft_wrap=whole)
-    for one in found:
-        if one.fault is not None:
-            out.print(f"{one.name} is left out: {one.fault}", soft_wrap=whole)
-        if one.pinned:
-            out.print(f"{one.name} is pinned: {', '.join(one.pinned)}", soft_wrap=whole)
+    for result in results:
+        if result.fault is not None:
+            out.print(f"{result.name} is left out: {result.fault}", soft_wrap=whole)
+        if result.pinned:
+            out.print(f"{result.name} is pinned: {', '.join(result.pinned)}", soft_wrap=whole)
     out.print(f"recommended: {best}: {why}", soft_wrap=whole)
     out.print(f"  use it with checkpoint={best} in evaluate, export and clone")
     if picture is not None:
         rows = [
-            {**vars(one.figures), "name": one.name, "labels": ", ".join(_labels(one))}
-            for one in found
-            if one.figures is not None
+            {**vars(result.figures), "name": result.name, "labels": ", ".join(_labels(result))}
+            for result in results
+            if result.figures is not None
         ]
         drawn = pd.DataFrame(rows)
         charts = (speed_and_stability(drawn, best), evaluated_laps(drawn))
@@ -293,7 +297,7 @@ def show_checkpoints(
                 Path(picture),
                 f"Checkpoints of {run.experiment.name}",
                 [f"Recommended: {best}, {why}.", run.path.name],
-                [("Evaluated laps", _page_table(found), f"{legend[0].upper()}{legend[1:]}.")],
+                [("Evaluated laps", _page_table(results), f"{legend[0].upper()}{legend[1:]}.")],
                 [chart for chart in charts if chart is not None],
             )
         out.print(f"\n{picture}: this table, speed against stability, and all evaluated laps", soft_wrap=True)

@@ -36,16 +36,16 @@ _LEAST_S = 60.0
 """... and this long in any case."""
 
 
-def race_against_log(run: StoredRun, view: LogView, given: str | None, err: Console) -> AgainstLog:
+def race_against_log(run: StoredRun, view: LogView, course_name: str | None, err: Console) -> AgainstLog:
     """Race the policy of a run's chosen checkpoint as the laps of a log, which `prepare_races` returned, were driven.
 
-    `given` is the name or the file of the course; None: that of the log.
+    `course_name` is the name or the file of the course; None: that of the log.
 
     Raises:
         BadInput: the log has no lap to compare, its course is unknown, or the checkpoint cannot be used.
         RunFailed: a car's state became NaN or infinite.
     """
-    config, track = course_driven(view, run.experiment, given)
+    config, track = course_driven(view, run.experiment, course_name)
     course = numbered_as_logged(track, view.steps)
     logged = logged_laps(view, course)
     stored = run.read_policy()
@@ -60,30 +60,33 @@ def race_against_log(run: StoredRun, view: LogView, given: str | None, err: Cons
 
 
 def course_driven(
-    view: LogView, experiment: Experiment, given: str | None = None
+    view: LogView, experiment: Experiment, course_name: str | None = None
 ) -> tuple[TrackConfig, Track]:
     """Return the course of a log, in the direction it was driven.
 
-    It is the one given, else the world that the log names or that its positions show, else one of the experiment's.
+    It is that of `course_name`, else the world that the log names or that its positions show, else one of the
+    experiment's.
 
     Raises:
         BadInput: it is none of them.
     """
     candidates: list[TrackConfig] = []
-    named = given or (view.course.name if view.course is not None else view.track_name)
+    named = course_name or (view.course.name if view.course is not None else view.track_name)
     if find_world(named) is not None:
         candidates += compose_experiment([override_line("track", find_world(named))])[0].tracks.values()
-    elif given is not None:
-        catalogue_track(given)  # names what is wrong with it
-        candidates += compose_experiment([override_line("track.file", given)])[0].tracks.values()
-    for config in candidates if given is not None else (*candidates, *experiment.tracks.values()):
+    elif course_name is not None:
+        catalogue_track(course_name)  # names what is wrong with it
+        candidates += compose_experiment([override_line("track.file", course_name)])[0].tracks.values()
+    for config in candidates if course_name is not None else (*candidates, *experiment.tracks.values()):
         forward, backward = (Track.from_config(config, reversed=back) for back in (False, True))
         if was_driven_on(forward, view.steps):
             track = directed(forward, backward, view.steps)
             return replace(config, direction="reversed" if track is backward else "forward"), track
     length_m = float(view.steps["track_len"].median())
-    if given is not None:
-        raise BadInput(f"--track {given}", f"is not where the car of {view.name} drove ({length_m:.2f} m)")
+    if course_name is not None:
+        raise BadInput(
+            f"--track {course_name}", f"is not where the car of {view.name} drove ({length_m:.2f} m)"
+        )
     raise BadInput(
         f"{view.name}: its track {view.track_name!r} ({length_m:.2f} m) is none of the service's worlds and none that "
         "the run was trained on; accepted: --track with the file of its route (.npy)"
@@ -128,22 +131,22 @@ def race_as_logged(
     recorder = LapRecorder(evaluator)
     attempts = evaluator(policy, recorder).groups[0].attempts
     kept = [
-        one
+        attempt
         for trial in range(len(starts))
-        for one in [attempt for attempt in attempts if attempt.trial == trial][: laps[trial]]
+        for attempt in [each for each in attempts if each.trial == trial][: laps[trial]]
     ]
     tables = []
     for number, attempt in enumerate(kept):
         first = int(attempt.begin_s > 0)  # the first step of a flying lap is the last of the one before
-        own, packed = recorder.rows(attempt)
-        own, packed = own[first:], packed[first:]
+        numbers, packed = recorder.rows(attempt)
+        numbers, packed = numbers[first:], packed[first:]
         steps = to_table(packed[:, :-1], 0, [config.name]).to_pandas()
         tables.append(
             steps.assign(
                 stream=STREAM,
                 worker=0,
                 episode=number,
-                steps=own + 1,
+                steps=numbers + 1,
                 tstamp=packed[:, -1],
                 done=np.arange(len(steps)) == len(steps) - 1,
                 wall_clock=np.nan,

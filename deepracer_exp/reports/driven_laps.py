@@ -44,17 +44,20 @@ def laps_to_replay(
     best = best_attempt(evaluation, {*np.flatnonzero(same if same.any() else ~same).tolist()})
     chosen = [(best, "the fastest" if best.complete else "the farthest")]
     if ordinary:
-        others = [one for one in evaluation.on(USUAL).attempts if one.complete and one is not best]
+        others = [
+            attempt for attempt in evaluation.on(USUAL).attempts if attempt.complete and attempt is not best
+        ]
         if not others:
             laps = count(int(best.complete), "complete lap")
             raise BadInput(
                 f"{run.path.name}, checkpoint {stored.path.name}: {laps} in {count(len(evaluator.trials), 'trial')}; "
                 "accepted: more evaluation.trials, or another run or log beside it to replay against"
             )
-        near = [one for one in others if starts[one.trial] == starts[best.trial]]
+        near = [attempt for attempt in others if starts[attempt.trial] == starts[best.trial]]
         chosen.append((_median(near or others), "an ordinary lap"))
     return [
-        _replayed(recorder, one, run, f"{words} of checkpoint {stored.path.name}") for one, words in chosen
+        _replayed(recorder, attempt, run, f"{words} of checkpoint {stored.path.name}")
+        for attempt, words in chosen
     ]
 
 
@@ -71,10 +74,10 @@ def commands_of_run(run: StoredRun) -> Commands:
     words: list[str] = []
     steps: list[NDArray[np.float64]] = []
     for group in evaluation.groups:
-        laps = [one for one in group.attempts if one.complete and not one.resets]
+        laps = [attempt for attempt in group.attempts if attempt.complete and not attempt.resets]
         if not laps:
             continue
-        times_s = np.array([one.time_s for one in laps])
+        times_s = np.array([attempt.time_s for attempt in laps])
         fast = fast_laps(times_s)
         words.append(
             fast_laps_in_words(int(fast.sum()), len(laps), float(times_s.min()), f"on {group.track}")
@@ -106,7 +109,7 @@ def _raced(
 
 
 def _median(attempts: Sequence[Attempt]) -> Attempt:
-    return sorted(attempts, key=lambda one: one.time_s)[len(attempts) // 2]
+    return sorted(attempts, key=lambda attempt: attempt.time_s)[len(attempts) // 2]
 
 
 def _replayed(recorder: LapRecorder, attempt: Attempt, run: StoredRun, words: str) -> ReplayedLap:

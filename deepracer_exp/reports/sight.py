@@ -59,8 +59,8 @@ def saliency(policy: nn.Module, acted: TensorDict, camera: CameraConfig) -> NDAr
     scores = torch.empty(cameras, places)
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         for eye in range(cameras):
-            own = (eye_of == eye).float()[:, None, None]  # (channels, 1, 1)
-            mixed = pixels + (blurred - pixels) * masks[:, None] * own
+            of_eye = (eye_of == eye).float()[:, None, None]  # (channels, 1, 1)
+            mixed = pixels + (blurred - pixels) * masks[:, None] * of_eye
             seen = acted.expand(places + 1).clone()
             seen["pixels"] = torch.cat([pixels[None], mixed]).round().byte()
             decided = _decision(policy(seen), acted)
@@ -121,13 +121,13 @@ def glimpses(
 
     `acted` is what it read and wrote in the n steps of the lap, [n].
     """
-    found = []
+    strip = []
     steering_deg, speed_mps = actions.commands(acted["action"].numpy())
     for step in np.unique(np.linspace(1, len(lap) - 1, GLIMPSES + 1).astype(int)[:-1]):
         picture = picture_of(acted[step], camera)
         size = (_ENLARGED * picture.width // camera.width, _ENLARGED * camera.height // camera.width)
         looked = under_heat(picture, saliency(policy, acted[step], camera), size)
-        found.append(
+        strip.append(
             Glimpse(
                 seen=png_uri(png(picture)),
                 looked=png_uri(png(looked)),
@@ -135,7 +135,7 @@ def glimpses(
                 decision=f"{degrees(steering_deg[step])}, {speed_mps[step]:.1f} m/s",
             )
         )
-    return found
+    return strip
 
 
 def run_glimpses(view: LogView, folder: Path, just_trained: bool = False) -> tuple[LogView, list[Glimpse]]:

@@ -81,10 +81,10 @@ class Frames:
             if self._camera is not None:
                 self._draw_sight(still, self._acted[step], self._camera)
             still.paste(self._decision.draw(step, self._acted[step]), (self._left, HEIGHT - _ACTIONS_HEIGHT))
-            for at in frames:
+            for row in frames:
                 frame = still.copy()
-                frame.paste(_board(self._shown, at, WIDTH - self._left), (self._left, 0))
-                frame.paste(self._map.draw(at, step), (self._left, _BOARD_HEIGHT))
+                frame.paste(_board(self._shown, row, WIDTH - self._left), (self._left, 0))
+                frame.paste(self._map.draw(row, step), (self._left, _BOARD_HEIGHT))
                 yield np.asarray(frame)
 
     def _draw_sight(self, frame: Image.Image, acted: TensorDict, camera: CameraConfig) -> None:
@@ -118,17 +118,17 @@ def _label(draw: ImageDraw.ImageDraw, corner: tuple[int, int], words: str) -> No
     draw.text((corner[0] + 7, corner[1] + 3), words, font=_font(15), fill=_INK)
 
 
-def _board(lap: Lap, at: int, width: int) -> Image.Image:
+def _board(lap: Lap, row: int, width: int) -> Image.Image:
     """Draw track, lap time, speed and progress."""
     image = Image.new("RGB", (width, _BOARD_HEIGHT), _PAGE)
     draw = ImageDraw.Draw(image)
-    share, end = lap.share(at), width - 24
+    share, end = lap.share(row), width - 24
     draw.text((24, 16), lap.title, font=_font(18), fill=_INK)
     # Right-aligned, so that the numbers do not jump.
-    words = (f"{lap.time_s[at]:.2f} s", f"{max(lap.speed_mps[at], 0.0):.2f} m/s", f"{100 * share:.0f}%")
+    words = (f"{lap.time_s[row]:.2f} s", f"{max(lap.speed_mps[row], 0.0):.2f} m/s", f"{100 * share:.0f}%")
     for right, text in zip((end - 240, end - 90, end), words, strict=True):
         draw.text((right, 12), text, font=_font(26), fill=_INK, anchor="ra")
-    if lap.held is not None and lap.held[at]:
+    if lap.held is not None and lap.held[row]:
         draw.text((end - 340, 12), "penalty", font=_font(26), fill=_CHOSEN, anchor="ra")
     draw.rounded_rectangle((24, 56, end, 64), 4, fill=_RULE)
     draw.rounded_rectangle((24, 56, 24 + max(8, (end - 24) * share), 64), 4, fill=_CHOSEN)
@@ -175,17 +175,17 @@ class _Map:
         self._colors = [tuple(color) for color in (255 * SPEED(shares)[:, :3]).astype(int).tolist()]
         self._drawn = 0
 
-    def draw(self, at: int, step: int) -> Image.Image:
+    def draw(self, row: int, step: int) -> Image.Image:
         """Return the view of a frame after a step; frames are drawn in their order."""
         pen = ImageDraw.Draw(self._canvas)
-        for frame in range(self._drawn + 1, at + 1):
+        for frame in range(self._drawn + 1, row + 1):
             ends = [(self._x[frame - 1], self._y[frame - 1]), (self._x[frame], self._y[frame])]
             pen.line(ends, fill=self._colors[frame], width=4 * _FINER)
-        self._drawn = at
+        self._drawn = row
         now = self._canvas.copy()
         if self._others is not None:
             pen = ImageDraw.Draw(now)
-            for corners, color in zip(self._others[at].tolist(), self._colors_of_others, strict=True):
+            for corners, color in zip(self._others[row].tolist(), self._colors_of_others, strict=True):
                 # Bots are nearly as dark as the road.
                 fill = _FAINT if max(color) < _DARK else tuple(color)
                 pen.polygon([tuple(point) for point in corners], fill, _INK, width=_FINER)
@@ -196,10 +196,10 @@ class _Map:
                 if x == x:  # not NaN
                     pen.line((*sensor, x, y), fill=_RAY, width=_FINER)
                     pen.ellipse((x - 5, y - 5, x + 5, y + 5), fill=_CHOSEN)
-        ahead = np.array([np.cos(self._yaw_rad[at]), -np.sin(self._yaw_rad[at])])
+        ahead = np.array([np.cos(self._yaw_rad[row]), -np.sin(self._yaw_rad[row])])
         left = np.array([ahead[1], -ahead[0]])
         corners = ((4, 0), (-19, 8), (-14, 0), (-19, -8))  # an arrow, pixels ahead and to the left
-        at_px = np.array([self._x[at], self._y[at]])
+        at_px = np.array([self._x[row], self._y[row]])
         arrow = [tuple(at_px + _FINER * (along * ahead + aside * left)) for along, aside in corners]
         ImageDraw.Draw(now).polygon(arrow, fill="#ffffff", outline="#000000", width=_FINER)
         return now.reduce(_FINER)
@@ -216,11 +216,11 @@ class _Probabilities:
         # One scale for the lap.
         self._highest = next(share for share in (0.2, 0.5, 1.0) if probabilities.max() <= share or share == 1)
 
-    def draw(self, at: int, acted: TensorDict) -> Image.Image:
+    def draw(self, row: int, acted: TensorDict) -> Image.Image:
         """Return the bars of a step; that of the chosen action is highlighted."""
         image = Image.new("RGB", (self._width, _ACTIONS_HEIGHT), _PAGE)
         draw = ImageDraw.Draw(image)
-        chosen, shares = int(acted["action"]), self._probabilities[at]
+        chosen, shares = int(acted["action"]), self._probabilities[row]
         step = (self._width - 48) / len(self._order)
         top, bottom = 38, _ACTIONS_HEIGHT - 52
         draw.text(
@@ -247,7 +247,7 @@ class _Distribution:
     def __init__(self, low: NDArray[np.float64], high: NDArray[np.float64], width: int) -> None:
         self._low, self._high, self._width = low, high, width
 
-    def draw(self, at: int, acted: TensorDict) -> Image.Image:
+    def draw(self, row: int, acted: TensorDict) -> Image.Image:
         """Return the two scales."""
         image = Image.new("RGB", (self._width, _ACTIONS_HEIGHT), _PAGE)
         draw = ImageDraw.Draw(image)

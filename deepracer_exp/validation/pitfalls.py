@@ -79,7 +79,7 @@ def _held(lap: Situations, row: int, step_s: float) -> Situations:
     held = lap[np.full(_HELD, row)]
     later = np.arange(1, _HELD + 1)
     still = np.zeros(_HELD)
-    return held.given(
+    return held.with_columns(
         steps=held.columns["steps"] + later,
         sim_time=held.columns["sim_time"] + later * step_s,
         speed=still,
@@ -162,7 +162,7 @@ def batch_differs(setup: RaceSetup, n: int) -> Iterator[str]:
         return
     places = sample(setup, n)
     before = situations(setup, places, earlier=True)
-    now = situations(setup, places).given(previous_progress=before.columns["progress"])
+    now = situations(setup, places).with_columns(previous_progress=before.columns["progress"])
     paid, rewards = batch(now.columns, (now.road,)), Probe(setup).rewards(now, before)
     wrong = np.flatnonzero(~np.isclose(paid, rewards, rtol=1e-6, atol=1e-9))
     if len(wrong):

@@ -206,10 +206,10 @@ def draw_reward_map(setup: RaceSetup, of: RewardGrid, state: State, path: Path) 
 
 def _scale(of: RewardGrid) -> tuple[Colormap, Normalize, str]:
     """Choose colours for the rewards on the track; values beyond, such as a penalty for leaving it, are clipped."""
-    everything = _known(of.reward, of.by_command, of.pixels)
+    everything = _finite(of.reward, of.by_command, of.pixels)
     if not len(everything):
         everything = np.zeros(1)
-    on_road = _known(of.reward[~of.off_track], of.by_command)
+    on_road = _finite(of.reward[~of.off_track], of.by_command)
     if not len(on_road):
         on_road = everything
     low, high = float(on_road.min()), float(on_road.max())
@@ -222,7 +222,7 @@ def _scale(of: RewardGrid) -> tuple[Colormap, Normalize, str]:
     return PAY, Normalize(low, high), extend
 
 
-def _known(*rewards: np.ndarray) -> np.ndarray:
+def _finite(*rewards: np.ndarray) -> np.ndarray:
     values = np.concatenate([some.ravel() for some in rewards])
     return values[np.isfinite(values)]
 

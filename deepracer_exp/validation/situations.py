@@ -38,7 +38,7 @@ class Situations:
         """Return a selection; an array of numbers may repeat some."""
         return Situations({key: column[which] for key, column in self.columns.items()}, self.road)
 
-    def given(self, **columns: np.ndarray) -> "Situations":
+    def with_columns(self, **columns: np.ndarray) -> "Situations":
         """Return the same situations with some columns replaced."""
         return Situations({**self.columns, **columns}, self.road)
 
@@ -177,7 +177,7 @@ def seam(setup: RaceSetup) -> Situations:
     half_way = situations(setup, poses(setup, 0.5, 0.0, 0.0, middle_speed_mps(setup)))
     track = setup.track
     x, y = track.waypoints[-1]
-    return half_way.given(
+    return half_way.with_columns(
         x=np.array([x]),
         y=np.array([y]),
         projection_distance=np.array([track.length_m]),

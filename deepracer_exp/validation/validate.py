@@ -236,9 +236,9 @@ def _sample(
 ) -> tuple[Situations, NDArray[np.float64]]:
     """Return n sampled situations and their rewards; adds the number of situations to `check`."""
     setup = check.setup
-    at = sample(setup, n)
-    now = situations(setup, at)
-    before = situations(setup, at, earlier=True)
+    places = sample(setup, n)
+    now = situations(setup, places)
+    before = situations(setup, places, earlier=True)
     with executed or nullcontext():
         rewards = probe.rewards(now, before if check.state == "earlier calls" else None)
     check.situations = n + len(check.tried)
