@@ -20,6 +20,8 @@ _EVALUATE_EPILOG = """\
   deepracer-exp evaluate RUN                                its best checkpoint
   deepracer-exp evaluate RUN evaluation=summit              three_trials, four_minutes, summit or aws_virtual
   deepracer-exp evaluate RUN evaluation=real_car            as the physical car sees and acts
+  deepracer-exp evaluate RUN evaluation=head_to_head rival=RUN
+                                                            races of two policies
   deepracer-exp evaluate RUN checkpoint=last evaluation.trials=20
   deepracer-exp evaluate RUN evaluation.tracks=[Oval_track,Bowtie_track]
   deepracer-exp evaluate RUN evaluation.held_out=null       on the usual conditions only

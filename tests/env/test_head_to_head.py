@@ -244,8 +244,8 @@ def test_weights_survive_the_way_to_another_process():
 
 
 def test_environments_without_anybody_to_drive_the_rival_are_refused():
-    assert "race.rivals.policy=newest" in refused(make_env, compose(*RACE))
-    assert "race.rivals.policy=newest" in refused(DeepRacerEnv, RACE)
+    assert "race.rivals.policy=pool" in refused(make_env, compose(*RACE))
+    assert "race.rivals.policy=pool" in refused(DeepRacerEnv, RACE)
 
 
 def test_a_rival_needs_a_closed_track_and_an_empty_road(tmp_path):
