@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from deepracer_exp.config.race import RaceConfig
 from deepracer_exp.env.placement import Placement, box_corners_of, rebuild_poses
-from deepracer_exp.sim.others import BOX_M, CAR_M, first_hit
+from deepracer_exp.sim.collisions import BOX_M, CAR_M, first_hit
 from deepracer_exp.tracks.track import Track
 
 from .statistics import Values, wilson

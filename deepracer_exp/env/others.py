@@ -1,6 +1,6 @@
 """Boxes and bots in a race: where they begin, whom a crash is blamed on, and what cars and reward functions see."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -8,12 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepracer_exp.config.race import RaceConfig
-from deepracer_exp.sim.others import Others, closest, next_ones
+from deepracer_exp.rewards.params import OBJECT_COLUMNS
+from deepracer_exp.sim.nearby import next_ones
+from deepracer_exp.sim.others import Others
+from deepracer_exp.sim.placement import episode_seeds
 from deepracer_exp.tracks.lanes import INNER, OUTER, Lanes
 from deepracer_exp.tracks.track import Pose
 
-from .observation import OTHERS
-from .placement import draw_placement
+from .object_params import ObjectParams
+from .placement import draw_placements
 from .randomization import CarStreams, Purpose
 from .rules import Bools, Ids, RaceRules, StepResult, lap_clock_s
 from .setup import RaceSetup
@@ -35,11 +38,6 @@ _GIVES_WAY = np.isin(
     [STATUS_CODE[status] for status in ("in_progress", "off_track", "immobilized", "reversed")],
 )
 """Statuses that a crash takes the place of; the end of a lap and of the time come first."""
-_VIEW = np.tan(0.5 * 1.13)
-"""Tangent of half the horizontal angle of view, of which 480/640 is visible vertically (deepracer-simapp,
-cameras/frustum.py)."""
-_EYE_M, _EYE_PITCH_RAD, _NEAREST_M = (0.14529379, 0.13032555), 0.2618, 0.2
-"""The camera ahead of and above the origin, its pitch, and the distance from which it sees (the same file)."""
 
 
 class RaceOthers:
@@ -50,6 +48,8 @@ class RaceOthers:
         held: cars that serve a penalty, (N,), bool: they stand, no rule is applied, and bots drive on.
         bots_stopped: cars whose bots stopped in the last step, (N,), bool.
     """
+
+    _kind: type[Others] = Others
 
     def __init__(self, race: RaceConfig, setup: RaceSetup, rules: RaceRules):
         """Set up; call `seed` and then `begin` next.
@@ -62,12 +62,13 @@ class RaceOthers:
         self._race, self._rules = race, rules
         tracks = [track for course in setup.courses for track in course.tracks]
         self.lanes = Lanes(tracks)
-        self.others = Others(race, self.lanes, rules.tracks, rules.n_cars)
+        self.others = self._kind(race, self.lanes, rules.tracks, rules.n_cars)
+        bots_mps = race.bots.speed_mps if race.bots.count else None
+        self._params = ObjectParams(self.others, rules, race.quirks, bots_mps)
         self._inner_is_left = np.array([not track.is_clockwise for track in tracks])
         self._period_s = setup.car.control_period_s
         self._front_m = setup.car.front_point_m
         self._observation = setup.observation
-        self._speed_scale_mps = setup.observation.speed_scale_mps
         self._held_until = np.zeros(rules.n_cars, np.int64)
         self._in_bot = np.zeros(rules.n_cars, bool)
         self.held = np.zeros(rules.n_cars, bool)
@@ -77,7 +78,7 @@ class RaceOthers:
 
     def seed(self, seed: int) -> None:
         """Start all streams from `seed`."""
-        self._streams = CarStreams(seed, self._rules.cars.tolist(), Purpose.OTHERS)
+        self._keys = CarStreams(seed, self._rules.cars.tolist(), Purpose.OTHERS).keys
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of everything the next steps depend on."""
@@ -114,7 +115,7 @@ class RaceOthers:
         return pose
 
     def judge(
-        self, result: StepResult, time_s: Floats | None = None
+        self, result: StepResult, time_s: Floats | None = None, wanted: Collection[str] = OBJECT_COLUMNS
     ) -> tuple[StepResult, dict[str, np.ndarray]]:
         """Apply the rules about others to the result of a step, and move the bots.
 
@@ -125,17 +126,36 @@ class RaceOthers:
         Args:
             result: of the step without others.
             time_s: since each episode's begin, (N,), as a recording has it; None: by the count of control steps.
+            wanted: keys about others that the reward function reads.
 
         Returns:
-            The result with crashes, and the columns `rewards.params.OBJECT_COLUMNS`, one row per car.
+            The result with crashes, and these columns, one row per car.
         """
         rules, others, now = self._rules, self.others, result.now
-        self.held = rules.steps <= self._held_until
-        running = result.running & ~self.held
         time_s = lap_clock_s(rules.steps, self._period_s) if time_s is None else time_s
         hit = others.hit(now.x_m, now.y_m, now.yaw_rad)
-        columns = self._columns(now, time_s)
+        columns = self._params.columns(now, time_s, wanted)
         others.drive(rules.track_index, time_s, rules.steps > 1)
+        self.held = rules.steps <= self._held_until
+        if not self.held.any() and (hit < 0).all():
+            for happened in (self._in_bot, self.bots_stopped):
+                happened[:] = False
+            return result, {**columns, "is_crashed": self._in_bot}
+        result, is_crashed = self._with_crashes(result, hit, time_s)
+        return result, {**columns, "is_crashed": is_crashed}
+
+    def _with_crashes(
+        self, result: StepResult, hit: NDArray[np.int64], time_s: Floats
+    ) -> tuple[StepResult, Bools]:
+        """Return the result of a step after crashes and pauses, and which cars have crashed.
+
+        Args:
+            result: of the step without others.
+            hit: what each car has run into, or -1, (N,).
+            time_s: since each episode's begin, (N,).
+        """
+        rules, others = self._rules, self.others
+        running = result.running & ~self.held
         has_hit = (hit >= 0) & running
         self._in_bot = has_hit & others.is_bot[hit]
         behind, ahead = self._who_is_behind(has_hit, hit, result.progress)
@@ -145,10 +165,9 @@ class RaceOthers:
         status = with_crashes(result.status, has_hit, behind)
         status[self.held] = STATUS_CODE["pause"]
         rules.rest(np.flatnonzero(self.held))
-        columns["is_crashed"] = has_hit & (status > STATUS_CODE["in_progress"])
         terminated, truncated = rules.ends(status)
-        judged = replace(result, running=running, status=status, terminated=terminated, truncated=truncated)
-        return judged, columns
+        result = replace(result, running=running, status=status, terminated=terminated, truncated=truncated)
+        return result, has_hit & (status > STATUS_CODE["in_progress"])
 
     def put_back(self, ids: Ids, pose: Pose, percent: Floats, crashed: Bools, hold_s: Floats) -> Pose:
         """Return where cars continue in the middle of their episodes, and hold them there.
@@ -187,28 +206,31 @@ class RaceOthers:
         return Pose(x, y, yaw_rad)
 
     def features(self, ids: Ids, now: Measures) -> NDArray[np.float32]:
-        """Return the features of the next others of the cars `ids`, (n, next_objects * len(OTHERS)), about -1..1.
+        """Return the features of the next others of the cars `ids`, (n, next_objects * 4), about -1..1.
 
         For each: `gap` from the car's front to its origin along the lap over `next_objects_reach_m`, below 0 beside the
         car; `side`, how far it is to the left of the car across the road, over half the road's width; `closing` speed
         over `speed_scale_mps`; `bot`, 1 for a bot and 0 for a box. One beyond the reach, or none: 1, 0, 0, 0.
         """
-        count, reach_m = self._observation.next_objects, self._observation.next_objects_reach_m
-        others, rules = self.others, self._rules
-        track_index = rules.track_index[ids]
-        length_m = rules.tracks.length_m[track_index]
-        out = np.zeros((len(ids), count, len(OTHERS)), np.float32)
-        following, gap_m = next_ones(others.distance_m[ids], now.ndist * length_m, length_m, count, BESIDE_M)
-        near = (following >= 0) & (gap_m < reach_m)
-        car = np.arange(len(ids))[:, None]
-        speed_mps = others.speeds_mps(lap_clock_s(rules.steps, self._period_s))[ids]
-        side_m = others.offset_m[ids][car, following] - now.offset_m[:, None]
-        closing_mps = now.speed_mps[:, None] - speed_mps[car, following]
-        out[..., 0] = np.where(near, gap_m / reach_m, 1.0)
-        out[..., 1] = np.where(near, np.clip(2 * side_m / now.track_width_m[:, None], -2, 2), 0.0)
-        out[..., 2] = np.where(near, closing_mps / self._speed_scale_mps, 0.0)
-        out[..., 3] = near & others.is_bot[following]
-        return out.reshape(len(ids), count * len(OTHERS))
+        others, rules, seen = self.others, self._rules, self._observation
+        return np.asarray(
+            next_ones(
+                ids,
+                others.distance_m,
+                others.offset_m,
+                others.is_bot,
+                others.speeds_mps(ids, lap_clock_s(rules.steps[ids], self._period_s)),
+                now.ndist * rules.length_m[ids],
+                now.offset_m,
+                now.speed_mps,
+                now.track_width_m,
+                rules.length_m[ids],
+                seen.next_objects,
+                BESIDE_M,
+                seen.next_objects_reach_m,
+                seen.speed_scale_mps,
+            )
+        )
 
     def boxes(self, ids: Ids) -> NDArray[np.float32]:
         """Return what cameras and LIDARs see of the others of the cars `ids`, (n, K, 9); see `camera.take_pictures`."""
@@ -219,15 +241,13 @@ class RaceOthers:
     def _place(self, ids: Ids) -> None:
         """Draw where the others of new episodes are, and put them there."""
         rules, race = self._rules, self._race
-        track_index = rules.track_index[ids]
-        count = race.boxes.count + race.bots.count
-        places_m, lanes = np.zeros((len(ids), count)), np.zeros((len(ids), count), np.int64)
-        seeds = np.zeros(len(ids), np.uint64)
-        for row, car in enumerate(ids.tolist()):
-            length_m, episode = float(rules.tracks.length_m[track_index[row]]), int(rules.episode[car])
-            drawn = draw_placement(race, length_m, episode, self._streams.stream(car, episode))
-            places_m[row], lanes[row], seeds[row] = drawn.places_m, drawn.lanes, drawn.seed
-        self.others.place(ids, track_index, places_m, lanes, seeds)
+        seeds = self._episode_seeds(ids)
+        places_m, lanes = draw_placements(race, rules.length_m[ids], rules.episode[ids], seeds)
+        self.others.place(ids, rules.track_index[ids], places_m, lanes, seeds)
+
+    def _episode_seeds(self, ids: Ids) -> NDArray[np.uint64]:
+        """Return a number for the cars `ids` that their seed, number and episode decide alone, (n,)."""
+        return np.asarray(episode_seeds(self._keys[ids], self._rules.episode[ids]))
 
     def _beside(self, ids: Ids, pose: Pose, checked: Bools) -> Pose:
         """Return start poses in the lane opposite to the nearest other where one is near, (n,) each."""
@@ -273,53 +293,6 @@ class RaceOthers:
     def _ahead_percent(self, own_percent: Floats, percent: Floats) -> Floats:
         """Return by how much of the lap cars are ahead of others, both counted from waypoint 0, (n,)."""
         return own_percent - percent
-
-    def _columns(self, now: Measures, time_s: Floats) -> dict[str, np.ndarray]:
-        """Return the params about others, one row per car; `is_crashed` is not known yet."""
-        others, rules = self.others, self._rules
-        as_service = self._race.quirks == "service"
-        bots, shape = self._race.bots.count, others.distance_m.shape
-        closest_two = closest(others.distance_m, now.ndist * rules.length_m)
-        yaw_rad = others.poses[..., 2]
-        if as_service:
-            heading = yaw_rad.copy() if bots else np.zeros(shape)
-            speed_mps = np.full(shape, self._race.bots.speed_mps if bots else 0.0)
-            # The service counts the own car as number 0 here and not there.
-            tested = closest_two[:, 1] - 1
-        else:
-            degrees = np.degrees(np.mod(yaw_rad + np.pi, 2 * np.pi) - np.pi)
-            heading, speed_mps = np.where(others.is_bot, degrees, 0.0), others.speeds_mps(time_s)
-            tested = closest_two[:, 1]
-        return {
-            "closest_objects": closest_two,
-            "objects_location": others.poses[..., :2].copy(),
-            "objects_left_of_center": others.offset_m > 0,
-            "object_in_camera": self._in_camera(now, tested),
-            "objects_speed": speed_mps,
-            "objects_heading": heading,
-            "objects_distance_from_center": np.abs(others.offset_m),
-            "objects_distance": others.distance_m.copy(),
-            "objects_mask": np.ones(shape, bool),
-        }
-
-    def _in_camera(self, now: Measures, tested: NDArray[np.int64]) -> Bools:
-        """Return whether an other's origin or a corner of its crash rectangle is in the camera's view, (N,).
-
-        Nothing hides anything. -1 is no other.
-        """
-        row = np.arange(len(tested))
-        poses, half_m = self.others.poses[row, tested], self.others.half_m[tested]
-        cos, sin = np.cos(poses[:, 2, None]), np.sin(poses[:, 2, None])
-        along = half_m[:, :1] * np.array([0, 1, 1, -1, -1])
-        across = half_m[:, 1:] * np.array([0, 1, -1, -1, 1])
-        dx = poses[:, :1] + cos * along - sin * across - now.x_m[:, None]
-        dy = poses[:, 1:2] + sin * along + cos * across - now.y_m[:, None]
-        cos, sin = np.cos(now.yaw_rad)[:, None], np.sin(now.yaw_rad)[:, None]
-        ahead, left = cos * dx + sin * dy - _EYE_M[0], cos * dy - sin * dx
-        depth = np.cos(_EYE_PITCH_RAD) * ahead + np.sin(_EYE_PITCH_RAD) * _EYE_M[1]
-        down = np.sin(_EYE_PITCH_RAD) * -ahead + np.cos(_EYE_PITCH_RAD) * _EYE_M[1]
-        seen = (depth > _NEAREST_M) & (np.abs(left) < _VIEW * depth) & (np.abs(down) < 0.75 * _VIEW * depth)
-        return np.asarray(seen.any(axis=1) & (tested >= 0))
 
 
 def with_crashes(status: NDArray[np.int64], has_hit: Bools, at_fault: Bools) -> NDArray[np.int64]:

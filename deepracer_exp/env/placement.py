@@ -1,5 +1,6 @@
 """The placement of boxes and bots in an episode: drawn, written beside the trace, and their poses rebuilt from it."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -7,8 +8,10 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from deepracer_exp.config.race import LANES, BotsConfig, BoxesConfig, RaceConfig
-from deepracer_exp.sim.others import BOX_M, END_M, Others
+from deepracer_exp.config.race import LANES, RaceConfig
+from deepracer_exp.sim.collisions import BOX_M
+from deepracer_exp.sim.others import Others
+from deepracer_exp.sim.placement import episode_seeds, place
 from deepracer_exp.sim.scenery import box_corners
 from deepracer_exp.tracks.lanes import Lanes
 from deepracer_exp.tracks.track import Track, Tracks
@@ -56,24 +59,31 @@ class Placement:
     """Decides when bots change lanes."""
 
 
-def draw_placement(race: RaceConfig, length_m: float, episode: int, stream: np.random.Generator) -> Placement:
-    """Draw where the others of an episode are.
+def draw_placements(
+    race: RaceConfig, length_m: Floats, episode: NDArray[np.int64], seeds: NDArray[np.uint64]
+) -> tuple[Floats, NDArray[np.int64]]:
+    """Draw where the others of episodes are: distances from the start line along the lap, and lanes, (n, K) each.
 
     Args:
         race: how many there are, and how they are placed.
-        length_m: of the centre line.
-        episode: its number among those of its car, from 0.
-        stream: of the car and the episode.
+        length_m: of the centre lines, (n,).
+        episode: their numbers among those of their cars, from 0, (n,).
+        seeds: of the episodes, (n,); see `sim.placement.episode_seeds`.
     """
-    seed = int(stream.integers(2**63))
-    if race.boxes.placement == "fixed":
-        positions = race.boxes.positions
-        boxes_m = np.array([position.lap for position in positions]) * length_m
-        lanes = np.array([LANES.index(position.lane) for position in positions], np.int64)
+    boxes, bots = race.boxes, race.bots
+    places_m = np.empty((len(seeds), boxes.count + bots.count))
+    lanes = np.empty(places_m.shape, np.int64)
+    of_boxes, of_bots = np.s_[:, : boxes.count], np.s_[:, boxes.count :]
+    if boxes.placement == "fixed":
+        places_m[of_boxes] = np.array([position.lap for position in boxes.positions]) * length_m[:, None]
+        lanes[of_boxes] = [LANES.index(position.lane) for position in boxes.positions]
     else:
-        boxes_m, lanes = _placed(race.boxes, _least_m(race, length_m, episode), length_m, stream)
-    bots_m, bots_lanes = _placed(race.bots, race.bots.min_distance_m, length_m, stream)
-    return Placement(np.concatenate([boxes_m, bots_m]), np.concatenate([lanes, bots_lanes]), seed)
+        least_m = _least_m(race, length_m, episode)
+        place(seeds, 0, boxes.placement == "random", least_m, length_m, places_m[of_boxes], lanes[of_boxes])
+    least_m = np.full(len(seeds), bots.min_distance_m)
+    random = bots.placement == "random"
+    place(seeds, boxes.count, random, least_m, length_m, places_m[of_bots], lanes[of_bots])
+    return places_m, lanes
 
 
 def placements_table(setup: RaceSetup, rows: NDArray[np.float64], extra: NDArray[np.float64]) -> pa.Table:
@@ -89,20 +99,24 @@ def placements_table(setup: RaceSetup, rows: NDArray[np.float64], extra: NDArray
     assert setup.others is not None
     number = rows[:, PACKED["episode"]].astype(np.int64)
     first = np.flatnonzero(np.diff(number, prepend=-1) != 0)
-    cars, place = np.unique(rows[first, PACKED["car"]].astype(np.int64), return_inverse=True)
-    streams = CarStreams(setup.seed, cars.tolist(), Purpose.OTHERS)
+    cars, index = np.unique(rows[first, PACKED["car"]].astype(np.int64), return_inverse=True)
+    episode = extra[first, 0].astype(np.int64)
+    seeds = episode_seeds(CarStreams(setup.seed, cars.tolist(), Purpose.OTHERS).keys[index], episode)
+    courses = [setup.courses[course] for course in rows[first, PACKED["track"]].astype(np.int64).tolist()]
+    # A car stays on its course, whose directions alternate.
+    tracks = [
+        course.tracks[count % len(course.tracks)]
+        for course, count in zip(courses, episode.tolist(), strict=True)
+    ]
+    lengths_m = np.array([track.length_m for track in tracks])
+    places_m, lanes = draw_placements(setup.others, lengths_m, episode, seeds)
     written = []
-    for row, last, car in zip(first.tolist(), [*first[1:].tolist(), len(rows)], place.tolist(), strict=True):
-        episode = int(extra[row, 0])
-        course = setup.courses[int(rows[row, PACKED["track"]])]
-        # A car stays on its course, whose directions alternate.
-        track = course.tracks[episode % len(course.tracks)]
-        drawn = draw_placement(setup.others, track.length_m, episode, streams.stream(car, episode))
+    for drawn, (row, last) in enumerate(itertools.pairwise([*first.tolist(), len(rows)])):
         stopped = row + np.flatnonzero(extra[row:last, 1])
         clock_s = lap_clock_s(rows[stopped, PACKED["steps"]], setup.car.control_period_s)
         values = (
-            *(int(number[row]), int(cars[car]), track.reversed, drawn.places_m.tolist()),
-            *(drawn.lanes.tolist(), drawn.seed, clock_s.tolist()),
+            *(int(number[row]), int(cars[index[drawn]]), tracks[drawn].reversed, places_m[drawn].tolist()),
+            *(lanes[drawn].tolist(), int(seeds[drawn]), clock_s.tolist()),
         )
         written.append(dict(zip(SCHEMA.names, values, strict=True)))
     return pa.Table.from_pylist(written, schema=SCHEMA)
@@ -178,32 +192,13 @@ def rebuild_poses(
     return poses, distance_m
 
 
-def _least_m(race: RaceConfig, length_m: float, episode: int) -> float:
-    """Return the least distance between boxes in an episode.
+def _least_m(race: RaceConfig, length_m: Floats, episode: NDArray[np.int64]) -> Floats:
+    """Return the least distances between boxes in episodes, (n,).
 
     The service takes its number for per cent of the lap, and applies that to its own result at every placement, of
     which there is one more than episodes (deepracer-simapp, agent_ctrl/obstacles_agent_ctrl.py).
     """
     least = race.boxes.min_distance_m
     if race.quirks == "fixed":
-        return least
-    return min(least * (length_m / 100) ** (episode + 2), length_m)
-
-
-def _placed(
-    config: BoxesConfig | BotsConfig, least_m: float, length_m: float, stream: np.random.Generator
-) -> tuple[Floats, NDArray[np.int64]]:
-    """Return places along the lap and lanes, (count,) each, as the service draws them.
-
-    At random, each in turn is moved to anywhere between its neighbours that keeps the least distance.
-    """
-    count = config.count
-    places_m = np.linspace(least_m, length_m - END_M, count)
-    if config.placement != "random":
-        return places_m, np.arange(count) % 2
-    for index in stream.permutation(count).tolist():
-        low_m = least_m if index == 0 else places_m[index - 1] + least_m
-        high_m = length_m - END_M if index == count - 1 else places_m[index + 1] - least_m
-        if low_m < high_m:
-            places_m[index] = stream.uniform(low_m, high_m)
-    return places_m, stream.integers(2, size=count)
+        return np.full(len(length_m), least)
+    return np.minimum(least * (length_m / 100) ** (episode + 2), length_m)

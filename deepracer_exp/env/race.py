@@ -287,7 +287,7 @@ class Race:
         result = self.rules.apply()
         objects: dict[str, np.ndarray] = {}
         if self.others is not None:
-            result, objects = self.others.judge(result)
+            result, objects = self.others.judge(result, wanted=self._reward_function.object_keys)
         self._require_finite(
             "action", np.stack([steering_deg, speed_mps], axis=1), ("steering", "speed"), action
         )

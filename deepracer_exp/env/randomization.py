@@ -46,6 +46,9 @@ class CarStreams:
 
     A stream depends only on the seed, the purpose, the car's number and the stream's number: not on how many cars,
     processes or threads there are, nor on earlier draws.
+
+    Attributes:
+        keys: a number for each car that seed, purpose and its number decide, (N,), uint64.
     """
 
     def __init__(self, seed: int, cars: Sequence[int], purpose: Purpose):
@@ -57,6 +60,7 @@ class CarStreams:
             .view(np.uint64)
             for car in cars
         ]
+        self.keys = np.array([key[0] for key in self._keys])
         self._philox = np.random.Philox()
         self._generator = np.random.Generator(self._philox)
         self._state = self._philox.state

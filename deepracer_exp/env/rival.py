@@ -10,8 +10,8 @@ from deepracer_exp.config.race import RaceConfig
 from deepracer_exp.errors import BadInput
 from deepracer_exp.sim.batch import CarState
 from deepracer_exp.sim.others import Others
-from deepracer_exp.tracks.lanes import INNER, OUTER
-from deepracer_exp.tracks.track import Pose
+from deepracer_exp.tracks.lanes import INNER, OUTER, Lanes
+from deepracer_exp.tracks.track import Pose, Tracks
 
 from .others import RaceOthers, around
 from .rules import Bools, Ids, RaceRules
@@ -29,8 +29,10 @@ class _OtherCar(Others):
         untouchable: whether it serves a penalty, so that nobody can run into it, (N,), bool.
     """
 
-    speed_mps: Floats
-    untouchable: NDArray[np.bool_]
+    def __init__(self, race: RaceConfig, lanes: Lanes, tracks: Tracks, n_cars: int):
+        """Set up arrays; arguments as for `Others`."""
+        super().__init__(race, lanes, tracks, n_cars)
+        self.speed_mps, self.untouchable = np.zeros(n_cars), np.zeros(n_cars, bool)
 
     def pause(self, hit: NDArray[np.bool_], time_s: Floats) -> None:
         """Do nothing: a car that was run into drives on."""
@@ -39,9 +41,9 @@ class _OtherCar(Others):
         """Return 0 for cars that have run into the other and -1 for all else, as `Others.hit` does."""
         return np.where(self.untouchable, -1, super().hit(x_m, y_m, yaw_rad))
 
-    def speeds_mps(self, time_s: Floats) -> Floats:
-        """Return how fast the other drives, (N, 1)."""
-        return self.speed_mps[:, None]
+    def speeds_mps(self, ids: Ids, time_s: Floats) -> Floats:
+        """Return how fast the others of the cars `ids` drive, (n, 1)."""
+        return self.speed_mps[ids, None]
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of all arrays."""
@@ -63,15 +65,15 @@ class RaceRival(RaceOthers):
         is_rival: whether these cars are the rivals, whose other is the learner.
     """
 
+    others: _OtherCar
+    _kind = _OtherCar
+
     def __init__(self, race: RaceConfig, setup: RaceSetup, rules: RaceRules):
         """Set up; arguments as for `RaceOthers`."""
         super().__init__(race, setup, rules)
         assert race.rivals is not None
         self._start_gap_m = race.rivals.start_gap_m
         self.is_rival = False
-        car = _OtherCar(race, self.lanes, rules.tracks, rules.n_cars)
-        car.speed_mps, car.untouchable = np.zeros(rules.n_cars), np.zeros(rules.n_cars, bool)
-        self.others = self._car = car
 
     @property
     def serving(self) -> Bools:
@@ -86,13 +88,8 @@ class RaceRival(RaceOthers):
         """
         self._held_until[ids] = 0
         rules = self._rules
-        if evaluated:
-            leads = rules.cars[ids] % 2 == 0
-        else:
-            streams, episodes = self._streams, rules.episode
-            draws = [int(streams.stream(car, int(episodes[car])).integers(2)) for car in ids.tolist()]
-            leads = np.array(draws, np.int64) == 0
-        leads = leads != self.is_rival
+        decides = rules.cars[ids] if evaluated else self._episode_seeds(ids)
+        leads = (decides % 2 == 0) != self.is_rival
         track_index = rules.track_index[ids]
         back = np.where(leads, 0.0, self._start_gap_m / rules.tracks.length_m[track_index])
         points = rules.tracks.points_at(rules.start_ndist[ids] - back, track_index)
@@ -106,7 +103,7 @@ class RaceRival(RaceOthers):
             cars: all others, (N,) each.
             serving: which of these serve a penalty, (N,).
         """
-        rules, car = self._rules, self._car
+        rules, car = self._rules, self.others
         points = np.stack([cars.x_m[ids], cars.y_m[ids]], axis=-1)
         projection = rules.tracks.project(points, rules.track_index[ids])
         car.poses[ids, 0, :2], car.poses[ids, 0, 2] = points, cars.yaw_rad[ids]

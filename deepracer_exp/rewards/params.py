@@ -39,7 +39,8 @@ OBJECT_COLUMNS = (
     "objects_distance",
 )
 """The keys about boxes and bots, one row per car: of K others (N, K), `objects_location` (N, K, 2); `is_crashed` and
-`object_in_camera` (N,), `closest_objects` (N, 2). Columns have them only where there are others."""
+`object_in_camera` (N,), `closest_objects` (N, 2). Columns have them only where there are others, and of these only such
+the reward function reads (`rewards.reads`)."""
 MASK = "objects_mask"
 """The further key of `reward_batch`: which entries of the arrays about others are others, (N, K); all others of a car
 come first."""
@@ -68,7 +69,7 @@ def select(columns: Mapping[str, np.ndarray], cars: NDArray[np.intp] | None) -> 
         column = columns[key]
         chosen[key] = np.array(column if cars is None else column[cars], dtype=_DTYPES.get(key, np.float64))
     if MASK in columns:
-        for key in (*OBJECT_COLUMNS, MASK):
+        for key in (*object_keys(columns), MASK):
             chosen[key] = columns[key].copy() if cars is None else columns[key][cars]
     return chosen
 
@@ -78,14 +79,23 @@ def rows(selected: Mapping[str, np.ndarray]) -> Iterable[Row]:
     return zip(*(selected[key].tolist() for key in COLUMNS), strict=True)
 
 
-def object_rows(selected: Mapping[str, np.ndarray]) -> Iterable[Row | None]:
-    """Return one tuple of Python values per car, in the order of `OBJECT_COLUMNS`; None for cars that are alone."""
+def object_keys(columns: Mapping[str, np.ndarray]) -> tuple[str, ...]:
+    """Return which of `OBJECT_COLUMNS` there are."""
+    return tuple(key for key in OBJECT_COLUMNS if key in columns)
+
+
+def object_rows(selected: Mapping[str, np.ndarray]) -> Iterable[dict[str, Any] | None]:
+    """Return the keys about others of each car with their Python values; None for cars that are alone."""
     if MASK not in selected:
         return itertools.repeat(None, len(selected["x"]))
-    return zip(*(selected[key].tolist() for key in OBJECT_COLUMNS), strict=True)
+    keys = object_keys(selected)
+    if not keys:
+        return itertools.repeat({}, len(selected["x"]))
+    values = zip(*(selected[key].tolist() for key in keys), strict=True)
+    return map(dict, map(zip, itertools.repeat(keys), values))
 
 
-def scalar_params(row: Row, road: TrackParams, objects: Row | None = None) -> dict[str, Any]:
+def scalar_params(row: Row, road: TrackParams, objects: dict[str, Any] | None = None) -> dict[str, Any]:
     """Build the 27 keys for one car.
 
     Every list is a fresh one, so that nothing a reward function does to it reaches another call; the keys
@@ -95,7 +105,7 @@ def scalar_params(row: Row, road: TrackParams, objects: Row | None = None) -> di
     Args:
         row: One tuple of `rows`; lengths in metres, angles in degrees, speed in m/s, time in seconds.
         road: The keys that are constant on the course.
-        objects: One tuple of `object_rows`; distances in metres, headings in degrees, speeds in m/s.
+        objects: One of `object_rows`; distances in metres, headings in degrees, speeds in m/s.
     """
     params = dict(
         zip(COLUMNS, row, strict=True),
@@ -114,7 +124,7 @@ def scalar_params(row: Row, road: TrackParams, objects: Row | None = None) -> di
         objects_distance=[],
     )
     if objects is not None:
-        params.update(zip(OBJECT_COLUMNS, objects, strict=True))
+        params.update(objects)
     return params
 
 

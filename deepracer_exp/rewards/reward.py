@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from deepracer_exp.errors import BadInput, RunFailed
 
 from .guard import CtrlC, DeadlinePassed, Guard, Misconduct
-from .params import TrackParams, batch_params, object_rows, rows, scalar_params, select
+from .params import OBJECT_COLUMNS, TrackParams, batch_params, object_rows, rows, scalar_params, select
 from .prints import RewardPrints
+from .reads import keys_read
 from .source import RewardSource, source_with_constants
 
 MAX_REWARD = 1e5
@@ -69,6 +70,7 @@ class RewardFunction:
     Attributes:
         is_batch: Whether `reward_batch` is called for all cars at once.
         functions: The modules' own functions, without checks and time limit; one per car, or the one of the batch.
+        object_keys: The keys about others that it may read; columns need no more of these.
 
     Raises:
         BadInput: The module cannot be run or has no callable `reward_function` or `reward_batch`.
@@ -99,6 +101,8 @@ class RewardFunction:
             what, cause = what_happened(error, source.path, time_limit_s)
             how = "" if isinstance(error, Unusable) else "cannot be run: "
             raise BadInput(source.path, f"{how}{what}") from cause
+        read = keys_read(source_with_constants(source), name)
+        self.object_keys = tuple(key for key in OBJECT_COLUMNS if read is None or key in read)
         self._track_params: Sequence[TrackParams] = ()
         self._waypoints: list[np.ndarray] = []
 
@@ -115,7 +119,7 @@ class RewardFunction:
 
         Args:
             columns: `params.BATCH_COLUMNS`, each (n_cars,), `closest_waypoints` (n_cars, 2), and with others on the
-                road `params.OBJECT_COLUMNS`.
+                road `params.MASK` and the `object_keys`.
             track_params: Params that are constant on each of the courses.
             active: Cars to reward, shape (n_cars,); None: all.
             track_index: Index in `track_params` of each car's course, shape (n_cars,); None: all drive on the first.

@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from deepracer_exp.config.race import BoxesConfig, RaceConfig
@@ -17,13 +16,10 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.tracks.lanes import Lanes, Paths
 from deepracer_exp.tracks.track import Track, TrackIndex, Tracks
 
-CAR_M = (0.32352, 0.1961)
-"""Crash rectangle of a car or bot, along and across, centred on its origin (deepracer-simapp,
-track_geom/constants.py)."""
-BOX_M = (0.50, 0.40)
-"""Crash rectangle of a box of any type; the first number of the service's pair is the extent across."""
-END_M = 1.0
-"""The last box or bot is placed at least so far before the start line (the service's)."""
+from .bots import drive
+from .collisions import BOX_M, CAR_M, first_hit
+from .placement import END_M
+
 _ROUNDING_S = 1e-9
 
 Floats = NDArray[np.float64]
@@ -74,7 +70,7 @@ class Others:
         self.seed = np.zeros(n_cars, np.uint64)
         self.pauses = np.zeros(n_cars, np.int64)
         self.resumes_s = np.zeros(n_cars)
-        self._everyone = np.arange(n_cars)
+        self._going_mps = np.where(self.is_bot, race.bots.speed_mps, 0.0)
 
     def place(
         self,
@@ -151,10 +147,10 @@ class Others:
         """
         return np.asarray(first_hit(x_m, y_m, yaw_rad, self.poses, self.half_m))
 
-    def speeds_mps(self, time_s: Floats) -> Floats:
-        """Return how fast the others move at a time since each episode's begin, (N,), as (N, K)."""
-        moving = time_s >= self.resumes_s - _ROUNDING_S
-        return np.where(self.is_bot, self._race.bots.speed_mps, 0.0) * moving[:, None]
+    def speeds_mps(self, ids: Ids, time_s: Floats) -> Floats:
+        """Return how fast the others of the cars `ids` move at a time since their episodes' begin, (n,), as (n, K)."""
+        moving = time_s >= self.resumes_s[ids] - _ROUNDING_S
+        return self._going_mps * moving[:, None]
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of all arrays."""
@@ -169,7 +165,7 @@ class Others:
         assert self._paths is not None
         bots, boxes = self._race.bots, self._boxes
         after_s = bots.lane_change_after_s or (math.inf, math.inf)
-        _drive(
+        drive(
             ids,
             track_index,
             time_s,
@@ -228,177 +224,3 @@ def check_room(race: RaceConfig, tracks: Sequence[tuple[str, Track]]) -> None:
                     f"race.{key}.min_distance_m={least_m:g} apart",
                     f"up to {most}",
                 )
-
-
-@njit(cache=True, nogil=True)
-def first_hit(x_m, y_m, yaw_rad, poses, half_m):  # type: ignore[no-untyped-def]
-    """Return the index of the first of K others whose rectangle contains a corner of each of N cars, or -1, (N,).
-
-    Args:
-        x_m: of the cars' origins, (N,), metres.
-        y_m: of the cars' origins, (N,), metres.
-        yaw_rad: headings of the cars, (N,).
-        poses: x, y and yaw of the others, (N, K, 3).
-        half_m: half the others' extents along and across, (K, 2).
-    """
-    cars, count = poses.shape[:2]
-    hit = np.full(cars, -1)
-    half_length, half_width = 0.5 * CAR_M[0], 0.5 * CAR_M[1]
-    reach = math.hypot(half_length, half_width)
-    for car in range(cars):
-        cos, sin = math.cos(yaw_rad[car]), math.sin(yaw_rad[car])
-        for other in range(count):
-            dx, dy = x_m[car] - poses[car, other, 0], y_m[car] - poses[car, other, 1]
-            near = reach + math.hypot(half_m[other, 0], half_m[other, 1])
-            if dx * dx + dy * dy >= near * near:
-                continue
-            turn_cos, turn_sin = math.cos(poses[car, other, 2]), math.sin(poses[car, other, 2])
-            for corner in range(4):
-                along = half_length if corner < 2 else -half_length
-                across = half_width if corner % 2 else -half_width
-                px, py = dx + cos * along - sin * across, dy + sin * along + cos * across
-                ahead, left = turn_cos * px + turn_sin * py, turn_cos * py - turn_sin * px
-                if abs(ahead) < half_m[other, 0] and abs(left) < half_m[other, 1]:
-                    hit[car] = other
-                    break
-            if hit[car] >= 0:
-                break
-    return hit
-
-
-@njit(cache=True, nogil=True)
-def closest(distance_m, own_m):  # type: ignore[no-untyped-def]
-    """Return the last of the others at or behind each car along the lap, and the first ahead of it, (N, 2).
-
-    Both wrap around: behind the first comes the last. With one other, both are that.
-
-    Args:
-        distance_m: of the others along the lap, (N, K), K at least 1.
-        own_m: of the cars' front points, (N,).
-    """
-    cars, count = distance_m.shape
-    nearest = np.empty((cars, 2), np.int64)
-    for car in range(cars):
-        behind = ahead = first = last = -1
-        for other in range(count):
-            distance = distance_m[car, other]
-            if distance <= own_m[car]:
-                if behind < 0 or distance > distance_m[car, behind]:
-                    behind = other
-            elif ahead < 0 or distance < distance_m[car, ahead]:
-                ahead = other
-            if first < 0 or distance < distance_m[car, first]:
-                first = other
-            if last < 0 or distance >= distance_m[car, last]:
-                last = other
-        nearest[car, 0] = behind if behind >= 0 else last
-        nearest[car, 1] = ahead if ahead >= 0 else first
-    return nearest
-
-
-@njit(cache=True, nogil=True)
-def next_ones(distance_m, own_m, length_m, count, behind_m):  # type: ignore[no-untyped-def]
-    """Return the next others of each car in order, (N, count), -1 where there are no more, and how far ahead they are.
-
-    Args:
-        distance_m: of the others along the lap, (N, K).
-        own_m: of the cars' front points, (N,).
-        length_m: of the lap, (N,).
-        count: how many of them.
-        behind_m: an other counts as ahead until it is so far behind.
-    """
-    cars, others = distance_m.shape
-    following, gap_m = np.full((cars, count), -1), np.full((cars, count), np.inf)
-    for car in range(cars):
-        for other in range(others):
-            gap = (distance_m[car, other] - own_m[car] + behind_m) % length_m[car] - behind_m
-            place = count
-            while place > 0 and gap < gap_m[car, place - 1]:
-                if place < count:
-                    following[car, place], gap_m[car, place] = (
-                        following[car, place - 1],
-                        gap_m[car, place - 1],
-                    )
-                place -= 1
-            if place < count:
-                following[car, place], gap_m[car, place] = other, gap
-    return following, gap_m
-
-
-@njit(cache=True)
-def _uniform(seed, bot, change):  # type: ignore[no-untyped-def]
-    """Return the number from 0 to 1 that decides when a bot changes lanes for the `change`-th time.
-
-    It needs no stream: a checkpoint holds the seed and the count (Steele and others, "Fast splittable pseudorandom
-    number generators", 2014: SplitMix64).
-    """
-    z = np.uint64(seed) + np.uint64(1 + 1000 * change + bot) * np.uint64(0x9E3779B97F4A7C15)
-    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    z = z ^ (z >> np.uint64(31))
-    return np.float64(z >> np.uint64(11)) * (1.0 / 9007199254740992.0)
-
-
-@njit(cache=True, nogil=True)
-def _drive(  # type: ignore[no-untyped-def]
-    ids,
-    track_index,
-    time_s,
-    paths,
-    speed_mps,
-    pause_s,
-    least_after_s,
-    most_after_s,
-    change_m,
-    start_m,
-    lane,
-    changes,
-    change_begin_s,
-    change_end_s,
-    seed,
-    pauses,
-    poses,
-    distance_m,
-    offset_m,
-):
-    """Move the bots of some cars to a time, and change their lanes; arrays of state have a row per car."""
-    changing = math.isfinite(least_after_s)
-    for place in range(len(ids)):
-        car, track, now_s = ids[place], track_index[place], time_s[place]
-        length_m, first, cells = paths.length_m[track], paths.first_row[track], paths.cells[track]
-        driven_m = speed_mps * max(now_s - pauses[car] * pause_s, 0.0)
-        for bot in range(start_m.shape[1]):
-            if changing and now_s >= change_end_s[car, bot]:
-                if changes[car, bot] > 0:
-                    lane[car, bot] = 1 - lane[car, bot]
-                share = _uniform(seed[car], bot, changes[car, bot])
-                changes[car, bot] += 1
-                begin_s = now_s + least_after_s + share * (most_after_s - least_after_s)
-                change_begin_s[car, bot] = begin_s
-                change_end_s[car, bot] = begin_s + change_m / speed_mps
-            at_m = (start_m[car, bot] + driven_m) % length_m
-            cell = at_m / length_m * cells
-            index = min(int(cell), cells - 1)
-            part = cell - index
-            before = paths.rows[lane[car, bot], first + index]
-            after = paths.rows[lane[car, bot], first + index + 1]
-            x, y = before[0] + part * (after[0] - before[0]), before[1] + part * (after[1] - before[1])
-            dx, dy = before[2] + part * (after[2] - before[2]), before[3] + part * (after[3] - before[3])
-            ahead = before[4] + part * (after[4] - before[4])
-            offset = before[5] + part * (after[5] - before[5])
-            if changing and now_s > change_begin_s[car, bot] and changes[car, bot] > 0:
-                # From lane to lane as a cubic with the lanes' own directions at both ends.
-                share = min((now_s - change_begin_s[car, bot]) * speed_mps / change_m, 1.0)
-                weight, slope = share * share * (3.0 - 2.0 * share), 6.0 * share * (1.0 - share) / change_m
-                before = paths.rows[1 - lane[car, bot], first + index]
-                after = paths.rows[1 - lane[car, bot], first + index + 1]
-                to_x = before[0] + part * (after[0] - before[0]) - x
-                to_y = before[1] + part * (after[1] - before[1]) - y
-                dx += weight * (before[2] + part * (after[2] - before[2]) - dx) + slope * to_x
-                dy += weight * (before[3] + part * (after[3] - before[3]) - dy) + slope * to_y
-                x, y = x + weight * to_x, y + weight * to_y
-                ahead += weight * (before[4] + part * (after[4] - before[4]) - ahead)
-                offset += weight * (before[5] + part * (after[5] - before[5]) - offset)
-            poses[car, bot, 0], poses[car, bot, 1], poses[car, bot, 2] = x, y, math.atan2(dy, dx)
-            distance_m[car, bot] = (at_m + ahead) % length_m
-            offset_m[car, bot] = offset

@@ -16,7 +16,7 @@ from deepracer_exp.env.head_to_head import HeadToHead, Rivals, rival_setup, weig
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.env.trace import EPISODE_STATUS, PACKED
-from deepracer_exp.sim.others import CAR_M
+from deepracer_exp.sim.collisions import CAR_M
 from tests.conftest import refused
 
 from .conftest import make_setup
@@ -100,7 +100,7 @@ def test_each_car_sees_where_the_other_is_now(duel):
         for one, other in ((race, race.rival), (race.rival, race)):
             now, shown = other.rules.now, one.others.others
             np.testing.assert_array_equal(shown.poses[:, 0], np.stack([now.x_m, now.y_m, now.yaw_rad], 1))
-            np.testing.assert_array_equal(shown.speeds_mps(None)[:, 0], now.speed_mps)
+            np.testing.assert_array_equal(shown.speeds_mps(np.arange(4), None)[:, 0], now.speed_mps)
     at = race.feature_names.index("next_1_closing")
     scale = race.setup.observation.speed_scale_mps
     ahead = race.observation[:, at - 2] < 1

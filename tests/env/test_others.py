@@ -9,7 +9,7 @@ from deepracer_exp.env.others import NEAR_M, with_crashes
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.env.trace import EPISODE_STATUS, PACKED, STATUS_CODE
-from deepracer_exp.sim.others import BOX_M
+from deepracer_exp.sim.collisions import BOX_M
 from tests.conftest import refused
 from tests.env.conftest import drive, make_setup, random_actions, spied
 
