@@ -5,13 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from deepracer_exp.env.others import RaceOthers
 from deepracer_exp.env.rules import RaceRules, lap_clock_s
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.env.state import Measures
 from deepracer_exp.env.trace import STATUS_CODE
-from deepracer_exp.rewards.params import BATCH_COLUMNS
+from deepracer_exp.rewards.params import BATCH_COLUMNS, MASK, OBJECT_COLUMNS
 from deepracer_exp.sim.batch import CarBatch
 
+from .objects import free_road
 from .situations import Situations
 
 Floats = NDArray[np.float64]
@@ -59,6 +61,8 @@ def action_space_laps(setup: RaceSetup) -> list[DrivenLap]:
 def drive_laps(setup: RaceSetup, lateral_mps2: Floats, share: Floats) -> list[DrivenLap | None]:
     """Drive n laps side by side by pursuit of the centre line; None: not completed with all wheels on the track.
 
+    In a race among others these are always half a lap away.
+
     Args:
         setup: the track, the car, and the action space with the highest speed and the lowest, which holds in bends.
         lateral_mps2: lateral acceleration in bends, (n,).
@@ -71,6 +75,7 @@ def drive_laps(setup: RaceSetup, lateral_mps2: Floats, share: Floats) -> list[Dr
     rules = RaceRules(setup, n)
     pose = rules.reset(start_ndist=np.zeros(n))
     batch.place(np.arange(n), pose.x, pose.y, pose.yaw_rad)
+    others = None if setup.others is None else RaceOthers(setup.others, setup, rules)
     driving, complete = np.ones(n, bool), np.zeros(n, bool)
     steps: list[dict[str, np.ndarray]] = []
     ends = np.zeros(n, np.int64)
@@ -83,13 +88,16 @@ def drive_laps(setup: RaceSetup, lateral_mps2: Floats, share: Floats) -> list[Dr
         wanted_mps = share * np.minimum(_bend_speed(setup, now, lateral_mps2), highest_mps)
         wanted_mps = np.maximum(wanted_mps, lowest_mps)
         steps.append(rules.params(result, steering_deg, wanted_mps))
+        if others is not None:
+            steps[-1] |= free_road(setup, rules, result, others)
         done = driving & (result.status == STATUS_CODE["lap_complete"])
         ends[done] = len(steps)
         complete |= done
         # On an open track the rear wheels start behind the road.
         driving &= ~done & (result.all_wheels_on_track | (result.progress < 5))
         batch.drive(wanted_mps, np.radians(steering_deg), moving=result.running & driving)
-    columns = {key: np.stack([step[key] for step in steps]) for key in BATCH_COLUMNS}
+    keys = (*BATCH_COLUMNS, *(() if others is None else (*OBJECT_COLUMNS, MASK)))
+    columns = {key: np.stack([step[key] for step in steps]) for key in keys}
     return [
         DrivenLap(
             speed_mps=float(max(share[i] * highest_mps, lowest_mps)),

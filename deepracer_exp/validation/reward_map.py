@@ -11,6 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize, TwoSlopeNorm
 from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike, NDArray
 
@@ -20,6 +21,7 @@ from deepracer_exp.errors import BadInput, writing
 from deepracer_exp.tracks.drawing import area_patch
 from deepracer_exp.tracks.outline import Outline, rings_of
 
+from .objects import outlines
 from .probe import Probe
 from .situations import OFF_ROAD_M, middle_speed_mps, poses, sample, situations
 
@@ -235,6 +237,10 @@ def _draw_course(axes: Axes, setup: RaceSetup) -> None:
     axes.plot(*track.waypoints.T, color=INK, linewidth=0.8, dashes=(6, 6), alpha=0.6, zorder=3)
     halo = [withStroke(linewidth=5.5, foreground=GROUND)]
     axes.plot(*outline.start_line.T, color=INK, linewidth=3.0, zorder=4, path_effects=halo)
+    for corners in outlines(setup):
+        axes.add_patch(
+            Polygon(corners, fill=False, edgecolor=INK, linewidth=1.6, zorder=4, path_effects=halo)
+        )
     # An arrow ahead of the start line shows the driving direction.
     pose = track.start_pose(np.array([0.35, 0.9]) / track.length_m)
     tail, head = zip(pose.x.tolist(), pose.y.tolist(), strict=True)

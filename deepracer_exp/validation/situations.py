@@ -8,11 +8,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from deepracer_exp.env.action_space import ContinuousActions
+from deepracer_exp.env.placement import Placement
 from deepracer_exp.env.rules import RaceRules
 from deepracer_exp.env.setup import RaceSetup
-from deepracer_exp.rewards.params import TrackParams, rows, scalar_params, select
+from deepracer_exp.rewards.params import TrackParams, object_rows, rows, scalar_params, select
 from deepracer_exp.sim.batch import CarState
+from deepracer_exp.tracks.lanes import INNER, OUTER
 from deepracer_exp.tracks.track import Track
+
+from .objects import QUIRKS, Quirks, all_at, first_placement, object_columns
 
 Floats = NDArray[np.float64]
 
@@ -22,7 +26,8 @@ class Situations:
     """Params of n situations on one road."""
 
     columns: dict[str, np.ndarray]
-    """`rewards.params.BATCH_COLUMNS`, each (n,), `closest_waypoints` (n, 2)."""
+    """`rewards.params.BATCH_COLUMNS`, each (n,), `closest_waypoints` (n, 2); among others also `OBJECT_COLUMNS` and
+    their mask."""
     road: TrackParams
 
     def __len__(self) -> int:
@@ -31,8 +36,9 @@ class Situations:
 
     def params(self) -> Iterator[dict[str, Any]]:
         """Yield fresh params of each situation."""
-        for row in rows(select(self.columns, np.arange(len(self)))):
-            yield scalar_params(row, self.road)
+        selected = select(self.columns, np.arange(len(self)))
+        for row, objects in zip(rows(selected), object_rows(selected), strict=True):
+            yield scalar_params(row, self.road, objects)
 
     def __getitem__(self, which: slice | np.ndarray) -> "Situations":
         """Return a selection; an array of numbers may repeat some."""
@@ -92,10 +98,17 @@ def poses(
     )
 
 
-def situations(setup: RaceSetup, where: Poses, earlier: bool = False) -> Situations:
+def situations(
+    setup: RaceSetup,
+    where: Poses,
+    earlier: bool = False,
+    placement: Placement | None = None,
+    quirks: Quirks | None = None,
+) -> Situations:
     """Return the params that the environment's rules compute for poses, or `earlier`, one step before.
 
-    Cars have driven straight at the commanded speed since then.
+    Cars have driven straight at the commanded speed since then. In a race among others all meet those of one placement,
+    by default that of the first episode; bots stand where they start.
     """
     n = len(where.ndist)
     place = setup.track.start_pose(where.ndist)
@@ -116,7 +129,10 @@ def situations(setup: RaceSetup, where: Poses, earlier: bool = False) -> Situati
     rules.measure(cars)
     rules.start_midway(steps_before, where.progress_before)
     rules.clock_steps[:] = steps_before
-    columns = rules.params(rules.apply(), where.steering_deg, where.speed_mps)
+    result = rules.apply()
+    columns = rules.params(result, where.steering_deg, where.speed_mps)
+    if setup.others is not None:
+        columns |= object_columns(setup, rules, result, placement or first_placement(setup), quirks)
     return Situations(columns, rules.track_params[0])
 
 
@@ -162,11 +178,55 @@ def named_situations(setup: RaceSetup, against: Track) -> list[NamedSituation]:
         _named("finish", setup, finish),
         _named("wrong way", setup, poses(setup, 0.5, 0.0, np.pi, speed)),
         _named("reversed track", backwards, poses(backwards, 0.5, 0.0, 0.0, speed)),
+        *_among_others(setup, speed),
     ]
 
 
-def _named(name: str, setup: RaceSetup, where: Poses) -> NamedSituation:
-    return NamedSituation(name, setup, situations(setup, where), situations(setup, where, earlier=True))
+def _named(name: str, setup: RaceSetup, where: Poses, placement: Placement | None = None) -> NamedSituation:
+    if placement is None and setup.others is not None:
+        placement = all_at(setup, float(where.ndist[0] + 0.4) * setup.track.length_m)
+    now, before = (situations(setup, where, earlier, placement) for earlier in (False, True))
+    return NamedSituation(name, setup, now, before)
+
+
+def _among_others(setup: RaceSetup, speed_mps: float) -> Iterator[NamedSituation]:
+    """Yield a car in the middle of the lap behind, beside and in the first box and the first bot of its race."""
+    race, track = setup.others, setup.track
+    if race is None:
+        return
+    inner_m = 0.25 * track.width_m * (-1 if track.is_clockwise else 1)
+    half_m = 0.5 * track.length_m
+    firsts = [("box", 0, race.boxes.count), ("bot", race.boxes.count, race.bots.count)]
+    for what, other, count in firsts:
+        if not count:
+            continue
+        for words, offset_m, ahead_m in (
+            (f"{what} ahead in its lane", inner_m, 0.8),
+            (f"{what} ahead in the other lane", -inner_m, 0.8),
+            (f"beside a {what}", -inner_m, 0.0),
+            (f"in a {what}", inner_m, 0.1),
+        ):
+            placement = all_at(setup, 0.0, INNER, other, half_m + ahead_m)
+            yield _named(words, setup, poses(setup, 0.5, offset_m, 0.0, speed_mps), placement)
+
+
+def quirky(setup: RaceSetup, where: Poses, placement: Placement) -> dict[str, tuple[Situations, Situations]]:
+    """Return situations with the documented value of each param that the service gets wrong, and with the service's."""
+    kinds: tuple[Quirks, Quirks] = ("fixed", "service")
+    documented, service = (situations(setup, where, placement=placement, quirks=kind) for kind in kinds)
+    return {key: (documented, documented.with_columns(**{key: service.columns[key]})) for key in QUIRKS}
+
+
+def near_the_start(setup: RaceSetup) -> Iterator[tuple[Situations, Situations]]:
+    """Yield a car in the middle of the lap, with an object just after the start line, and with one 3 m further."""
+    where = poses(setup, 0.5, 0.0, 0.0, middle_speed_mps(setup))
+    for lane in (INNER, OUTER):
+        for at_m in (0.1, 0.4, 0.7):
+            near, far = (
+                situations(setup, where, placement=all_at(setup, 4.0, lane, 0, place_m))
+                for place_m in (at_m, at_m + 3.0)
+            )
+            yield near, far
 
 
 def seam(setup: RaceSetup) -> Situations:

@@ -13,6 +13,7 @@ from deepracer_exp.tracks.track import Track
 from deepracer_exp.validation import reward_map
 from deepracer_exp.validation import validate as checking
 from deepracer_exp.validation.laps import DrivenLap, action_space_laps
+from deepracer_exp.validation.objects import with_others
 from deepracer_exp.validation.validate import Check, look_closer, read, try_named_situations
 
 
@@ -55,7 +56,7 @@ def coarsely(laps: list[DrivenLap], monkeypatch: pytest.MonkeyPatch) -> None:
 
     def driven(setup: RaceSetup) -> list[DrivenLap]:
         same = (setup.track.name, setup.track.reversed, setup.actions.n) == ("reinvent_base", False, 15)
-        return laps if same else action_space_laps(setup)
+        return laps if same and setup.others is None else action_space_laps(setup)
 
     monkeypatch.setattr(checking, "action_space_laps", driven)
     monkeypatch.setattr(checking, "_DETAILS", ((float("inf"), 0.2),))
@@ -68,7 +69,8 @@ def check_of(race_with: Callable[..., RaceSetup], against: Track, coarsely: None
     """Check a reward function given as text, completely."""
 
     def build(text: str, time_limit_s: float = 60.0) -> Check:
-        check = Check(setup=race_with(text, time_limit_s), against=against, discount=0.99, aws=[])
+        setup = with_others(race_with(text, time_limit_s))
+        check = Check(setup=setup, against=against, discount=0.99, aws=[])
         try_named_situations(check)
         if not check.failures:
             look_closer(check)
