@@ -9,7 +9,6 @@ import operator
 import re
 import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deepracer_exp.errors import BadInput, nearest
@@ -70,7 +69,7 @@ def _list(args: argparse.Namespace) -> int:
     elif not stores.runs_dir.is_dir():
         raise BadInput(f"runs_dir={stores.runs_dir}: is not a folder; `deepracer-exp train` creates it")
     else:
-        rows = rows_of_folder(stores.runs_dir, _is_held)
+        rows = rows_of_folder(stores.runs_dir)
     columns = _columns(rows)
     for condition in args.where:
         holds = _condition(condition, columns)
@@ -94,12 +93,6 @@ def _list(args: argparse.Namespace) -> int:
         where = stores.runs_dir if stores.uri is None else stores.uri
         print(f"no runs in {where}" + " that meet the conditions" * bool(args.where))
     return 0
-
-
-def _is_held(run: Path) -> bool:
-    from deepracer_exp.runs.folder import is_held  # imports Hydra, which a run that has ended does without
-
-    return is_held(run)
 
 
 def _columns(rows: "Sequence[Row]") -> list[str]:

@@ -1,7 +1,6 @@
 """The runs of a folder as rows: what `deepracer-exp runs` lists."""
 
 import datetime
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -31,13 +30,13 @@ exploring lap, all in seconds."""
 Row = dict[str, Any]
 
 
-def rows_of_folder(runs_dir: Path, is_held: Callable[[Path], bool]) -> list[Row]:
-    """Return a row for each run of a folder, the newest first; `is_held` says whether a run is in progress."""
-    rows = [_of_folder(folder, is_held) for folder in run_folders(runs_dir)]
+def rows_of_folder(runs_dir: Path) -> list[Row]:
+    """Return a row for each run of a folder, the newest first."""
+    rows = map(_of_folder, run_folders(runs_dir))
     return sorted(rows, key=lambda row: (row["began"], row["run"]), reverse=True)
 
 
-def _of_folder(folder: Path, is_held: Callable[[Path], bool]) -> Row:
+def _of_folder(folder: Path) -> Row:
     row: Row = dict.fromkeys(COLUMNS)
     row |= {"run": f"{folder.parent.name}/{folder.name}", "began": iso_time(_began_s(folder))}
     try:
@@ -46,7 +45,11 @@ def _of_folder(folder: Path, is_held: Callable[[Path], bool]) -> Row:
         machine = read_object(folder / PROVENANCE).get("machine") or {}
     except BadInput:  # one damaged run does not hide the others
         return row | {"state": "unreadable"}
-    row["state"] = str(summary.get("status") or ("running" if is_held(folder) else "killed"))
+    if not summary.get("status"):
+        from .folder import is_held  # imports Hydra, which a run that has ended does without
+
+        summary = {"status": "running" if is_held(folder) else "killed"}
+    row["state"] = str(summary["status"])
     best = summary.get("best") or {}
     row |= {"lap_s": best.get("eval_lap_time_s"), "score_s": best.get("eval_race_score_s")}
     row |= {"exploring_laps": summary.get("laps"), "exploring_lap_s": summary.get("best_lap_time_s")}
