@@ -291,10 +291,6 @@ def _episodes(
 
 
 def prepare_races(recording: Recording, track: str | None = None) -> LogView:
-    """Prepare the evaluations and races of a log, or if there are none its training.
-
-    Raises:
-        BadInput: as for `prepare`.
-    """
+    """Prepare the evaluations and races of a log, or if there are none its training; raises as `prepare`."""
     raced = (recording.steps["stream"] != TRAINING).to_numpy()
     return prepare(replace(recording, steps=recording.steps[raced]) if raced.any() else recording, track)

@@ -108,11 +108,7 @@ class Cars:
         return ray.util.get_node_ip_address(), os.getpid()
 
     def drive(self) -> tuple[dict[Key, np.ndarray], str]:
-        """Return a batch [cars, T] by key, and what the reward function printed.
-
-        Raises:
-            RunFailed: as `RaceEnv` does.
-        """
+        """Return a batch [cars, T] by key, and what the reward function printed; raises as `RaceEnv` does."""
         batch = next(self._source)
         return {key: value.numpy() for key, value in batch.items(True, True)}, self._kept.take()
 

@@ -85,11 +85,7 @@ def compose_experiment(overrides: Sequence[str], *, stored: bool = False) -> tup
 
 
 def compose_evaluation(overrides: Sequence[str]) -> tuple[EvaluateConfig, Composition]:
-    """Compose `conf/evaluate.yaml` with the overrides and validate the result.
-
-    Raises:
-        BadInput: as for `compose_experiment`.
-    """
+    """Compose `conf/evaluate.yaml` with the overrides and validate the result; raises as `compose_experiment`."""
     composition = compose_entry("evaluate", overrides)
     config = parse_config(composition.mapping, EvaluateConfig)
     _check_names(config.evaluation)

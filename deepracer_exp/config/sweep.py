@@ -139,11 +139,7 @@ class SweepRequest:
 
     @cached_property
     def protocol(self) -> EvaluationConfig:
-        """The protocol by which trials are judged.
-
-        Raises:
-            BadInput: as `compose_evaluation`.
-        """
+        """The protocol by which trials are judged; raises as `compose_evaluation`."""
         return compose_evaluation([f"evaluation={self.entry.sweep.protocol}"])[0].evaluation
 
     @cached_property

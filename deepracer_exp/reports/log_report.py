@@ -19,7 +19,7 @@ from deepracer_exp.analysis.charts import (
 )
 from deepracer_exp.analysis.charts.figure import Chart
 from deepracer_exp.analysis.charts.runs import generalisation_matrix, generations, policy_of, run_folder
-from deepracer_exp.analysis.findings import Finding, findings
+from deepracer_exp.analysis.findings import Finding
 from deepracer_exp.analysis.log_tables import (
     best_laps,
     candidate_rows,
@@ -28,14 +28,13 @@ from deepracer_exp.analysis.log_tables import (
     iteration_rows,
     problem_rows,
 )
-from deepracer_exp.analysis.log_view import LogView, prepare
+from deepracer_exp.analysis.log_view import LogView
 from deepracer_exp.analysis.reward_replay import ReplayedRewards
-from deepracer_exp.aws.logs.recording import Recording, readable
+from deepracer_exp.aws.logs.recording import readable
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.files import atomic_write
 from deepracer_exp.lookup.next_steps import next_steps, official_place, outcome
 from deepracer_exp.runs.files import read_head
-from deepracer_exp.runs.recording import RunRecording
 
 from .page import Glimpse, Plot, plot_of, render
 
@@ -114,17 +113,6 @@ class LogPage:
     """Contribution of each term of the reward function, as `contributed_terms` returns it."""
     strip: Sequence[Glimpse] = ()
     """Pictures that the best policy sees along a lap."""
-
-
-def write_report(log: Recording | RunRecording, path: Path) -> Path:
-    """Write the page of a recording atomically.
-
-    Raises:
-        BadInput: the recording has no steps.
-        OSError: the page cannot be written.
-    """
-    view = prepare(log)
-    return write_log_page(path, LogPage(view, findings(view)))
 
 
 def write_log_page(path: Path, page: LogPage) -> Path:

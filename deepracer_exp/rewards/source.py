@@ -72,11 +72,7 @@ def load_reward_source(config: RewardConfig) -> RewardSource:
 
 
 def named_reward_source(reward: str) -> RewardSource:
-    """Read a reward function of the zoo by its name, or any by its file.
-
-    Raises:
-        BadInput: as for `load_reward_source`.
-    """
+    """Read a reward function of the zoo by its name, or any by its file; raises as `load_reward_source`."""
     is_file = reward not in zoo_names() and (reward.endswith(".py") or Path(reward).exists())
     file = reward if is_file else None
     return load_reward_source(RewardConfig(name=reward, file=file, constants={}, time_limit_s=1.0))

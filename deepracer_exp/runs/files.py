@@ -92,11 +92,7 @@ def read_record(path: Path) -> RunRecord:
 
 
 def read_head(path: Path) -> RunRecord:
-    """Read a run's folder without the rows of metrics.jsonl, which is long.
-
-    Raises:
-        BadInput: as for `read_record`.
-    """
+    """Read a run's folder without the rows of metrics.jsonl, which is long; raises as `read_record`."""
     return RunRecord(path, read_config(path), [], read_object(path / SUMMARY), read_object(path / PROVENANCE))
 
 

@@ -130,11 +130,7 @@ def deliver_labels(run_id: str, labels: Labels, uri: str | None, runs_dir: Path)
 
 
 def recorded_labels(run_id: str, uri: str | None, runs_dir: Path) -> Labels:
-    """Return the name, note and tags that a run has in MLflow.
-
-    Raises:
-        BadInput: as of `deliver_labels`.
-    """
+    """Return the name, note and tags that a run has in MLflow; raises as `deliver_labels`."""
     with open_client(run_id, uri, runs_dir) as client:
         tags = client.get_run(run_id).data.tags
     labels = {key.removeprefix(USER_TAG): value for key, value in tags.items() if key.startswith(USER_TAG)}

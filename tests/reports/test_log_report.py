@@ -13,7 +13,7 @@ from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.reward_replay import ReplayedRewards
 from deepracer_exp.aws.logs.recording import LogProblem, Recording
 from deepracer_exp.errors import BadInput
-from deepracer_exp.reports.log_report import SECTIONS, LogPage, write_report
+from deepracer_exp.reports.log_report import SECTIONS, LogPage, write_log_page
 from deepracer_exp.reports.log_report import html as page_html
 from deepracer_exp.runs.recording import RunRecording
 from deepracer_exp.runs.result import RunResult
@@ -22,6 +22,11 @@ from tests.browser import needs_chromium
 from tests.page_html import Html
 
 NASTY = "</script><script>alert(1)</script><img src=x onerror=alert(2)>&'\"{{7*7}}"
+
+
+def write_report(log: Recording | RunRecording, path: Path) -> Path:
+    view = prepare(log)
+    return write_log_page(path, LogPage(view, findings(view)))
 
 
 def season(iterations: int = 12, **changes: object) -> Recording:

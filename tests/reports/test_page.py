@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from deepracer_exp.reports.log_report import write_report as write_log_report
 from deepracer_exp.sweeps.report.page import write_study_page as write_sweep_report
 from tests.browser import needs_chromium
 from tests.page_html import Html
 from tests.sweeps.studies import season as study
 
 from .test_log_report import season as recording
+from .test_log_report import write_report as write_log_report
 
 pytestmark = needs_chromium
 
