@@ -47,13 +47,8 @@ class Lidar:
     ) -> None:
         """Set up the walls; call `seed` and then `begin` next.
 
-        Args:
-            config: how a scan is read.
-            tracks: one per course.
-            cars: their numbers over all processes.
-            period_s: control period.
-            boxes: beside the road around each car.
-            others: boxes and bots on the road around each car.
+        `cars` are numbers over all processes; `boxes` stand beside the road around each car, `others` are boxes and
+        bots on it.
         """
         self._config, self._cars = config, list(cars)
         rings = [None if track.floor.walls_height_m < MOUNT_Z_M else wall_ring(track) for track in tracks]
@@ -100,10 +95,7 @@ class Lidar:
     def read(self, ids: Ids, state: CarState, steps: NDArray[np.int64]) -> Readings:
         """Return the readings of new scans by the cars `ids`, (n, size).
 
-        Args:
-            ids: indices of the cars, (n,).
-            state: of these cars, arrays (n,).
-            steps: control steps of each of these cars' episodes, (n,).
+        State and control steps are those of these cars' episodes, arrays (n,).
         """
         poses = np.stack(
             [

@@ -52,13 +52,7 @@ class RaceOthers:
     _kind: type[Others] = Others
 
     def __init__(self, race: RaceConfig, setup: RaceSetup, rules: RaceRules):
-        """Set up; call `seed` and then `begin` next.
-
-        Args:
-            race: how many others there are, and where.
-            setup: of the race.
-            rules: of the same cars.
-        """
+        """Set up; call `seed` and then `begin` next."""
         self._race, self._rules = race, rules
         tracks = [track for course in setup.courses for track in course.tracks]
         self.lanes = Lanes(tracks)
@@ -98,10 +92,8 @@ class RaceOthers:
     def begin(self, ids: Ids, pose: Pose, evaluated: bool) -> Pose:
         """Place the others of new episodes and return where the cars start, in another lane where one is near.
 
-        Args:
-            ids: indices of the cars, (n,).
-            pose: where they would start, on the centre line, (n,) each.
-            evaluated: whether the start is that of an evaluation, where the service ignores the others.
+        `pose` is where they would start, on the centre line, (n,) each. At the start of an evaluation (`evaluated`) the
+        service ignores the others.
         """
         self._held_until[ids] = 0
         first = self._rules.episode[ids] <= 0
@@ -172,15 +164,11 @@ class RaceOthers:
     def put_back(self, ids: Ids, pose: Pose, percent: Floats, crashed: Bools, hold_s: Floats) -> Pose:
         """Return where cars continue in the middle of their episodes, and hold them there.
 
+        `pose` and `percent` are where they would continue without others, `hold_s` is how long each is held there, (n,)
+        each.
+
         A car that has run into a bot stays where it is; one near a box continues 1 m before it in the other lane
         (deepracer-simapp, agent_ctrl/rollout_agent_ctrl.py: `_get_car_reset_model_state`).
-
-        Args:
-            ids: indices of the cars, (n,).
-            pose: where they would continue without others, (n,) each.
-            percent: progress at which they would, (n,).
-            crashed: whether they have crashed, (n,).
-            hold_s: how long each is held there, (n,).
         """
         rules, others = self._rules, self.others
         self._held_until[ids] = rules.steps[ids] + np.round(hold_s / self._period_s).astype(np.int64)
@@ -298,14 +286,11 @@ class RaceOthers:
 def with_crashes(status: NDArray[np.int64], has_hit: Bools, at_fault: Bools) -> NDArray[np.int64]:
     """Return status codes after crashes, (N,).
 
+    Each of the arguments is (N,); `status` has the codes of `env.trace.STATUS_CODE` without crashes.
+
     A car at fault has crashed. One that is not drives on, and leaving the road, driving backwards or standing in that
     step does not count either. The end of a lap and of the time have priority (deepracer-simapp,
     agent_ctrl/rollout_agent_ctrl.py: `_check_for_episode_termination`).
-
-    Args:
-        status: codes of `env.trace.STATUS_CODE` without crashes, (N,).
-        has_hit: which cars have run into another, (N,).
-        at_fault: which of them are at fault, (N,).
     """
     outcome = np.where(at_fault, STATUS_CODE["crashed"], STATUS_CODE["in_progress"])
     return np.where(has_hit & _GIVES_WAY[status], outcome, status)

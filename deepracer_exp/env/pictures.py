@@ -43,12 +43,8 @@ class Pictures:
     ) -> None:
         """Build the scenery.
 
-        Args:
-            config: size, colour and number of pictures.
-            car: where the camera sits.
-            tracks: one per course.
-            varied: what differs from episode to episode, drawn before the pictures are taken; None: nothing.
-            of_car: how the physical car makes pictures; None: each pixel is the mean of what it sees.
+        `varied` differs from episode to episode and is drawn before the pictures are taken. `of_car` makes pictures as
+        the physical car does; without it each pixel is the mean of what it sees.
         """
         self._of_car, finer = of_car, 1 if of_car is None else FRAME_SCALE
         self._varied = varied

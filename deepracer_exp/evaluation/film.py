@@ -114,10 +114,8 @@ class LapRecorder:
     def __init__(self, evaluator: Evaluator, seen_in: Attempt | None = None) -> None:
         """Record the next evaluation.
 
-        Args:
-            evaluator: called with this object.
-            seen_in: the lap whose inputs and outputs are kept, of an earlier evaluation of the same policy: pictures of
-                all laps would not fit into memory. None: of no lap.
+        `seen_in` is the lap whose inputs and outputs are kept, of an earlier evaluation of the same policy: pictures of
+        all laps would not fit into memory.
         """
         self._evaluator, self._seen_in = evaluator, seen_in
         self._steps: list[NDArray[np.float64]] = []

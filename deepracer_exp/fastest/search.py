@@ -77,11 +77,7 @@ class Search:
     def __init__(self, car: CarConfig, track: Track, low: Floats, high: Floats) -> None:
         """Put the car at its start.
 
-        Args:
-            car: the simulated car.
-            track: with its floor.
-            low: lowest [speed_mps, steering_rad] that is commanded, within the limits of the car, (2,).
-            high: highest, likewise.
+        `low` and `high` limit the commands [speed_mps, steering_rad], within the limits of the car, (2,) each.
         """
         self._car, self._track, self._limits = car, track, np.array([low, high])
         self._cars, self._drive = one_car(car, track.floor.friction), drive_record()
@@ -92,9 +88,7 @@ class Search:
     def run(self, lines: Sequence[Floats], on_round: OnRound) -> Floats:
         """Return the commands of the fastest lap that was found, [speed_mps, steering_rad] of each period, (n, 2).
 
-        Args:
-            lines: first guesses of the way, (n, 2) each, from the start on.
-            on_round: called after each plan.
+        `lines` are first guesses of the way, (n, 2) each, from the start on; `on_round` is called after each plan.
 
         Raises:
             RunFailed: no lap is possible within the limits.

@@ -28,11 +28,8 @@ def laps_to_replay(
 ) -> list[ReplayedLap]:
     """Race a run's checkpoint on the usual conditions and return its fastest lap, or the one that came farthest.
 
-    Args:
-        run: with its checkpoint.
-        protocol: of the race.
-        beside: the lap is one of those that began where this one did, if there are any.
-        ordinary: whether to add the median of the other complete laps, of those from the same start if there are any.
+    The lap is one of those that began where `beside` did, if there are any. `ordinary` adds the median of the other
+    complete laps, of those from the same start if there are any.
 
     Raises:
         BadInput: the checkpoint, a track or a condition cannot be used, or there is no other complete lap.

@@ -22,14 +22,11 @@ _TIGHTEST_PER_M = 3.0
 def ability_of(car: CarConfig, low: Floats, high: Floats, floor_friction: float = 1.0) -> Ability:
     """Drive cars with random commands within limits and return the most that any of them did.
 
+    `low` and `high` are limits of [speed_mps, steering_rad], (2,); `floor_friction` is a factor on the friction of the
+    tyres.
+
     Bends count with the mean speed over `WINDOW_M` on either side: for so long a car can turn faster than it could for
     good, while it slides or its weight shifts.
-
-    Args:
-        car: the car.
-        low: lowest [speed_mps, steering_rad], (2,).
-        high: highest, likewise.
-        floor_friction: factor on the friction of its tyres.
     """
     steps, random = int(_SECONDS * car.control_hz), np.random.default_rng(0)
     cars = CarBatch(car, _CARS, 1, floor_friction)

@@ -47,11 +47,7 @@ class Others:
     def __init__(self, race: RaceConfig, lanes: Lanes, tracks: Tracks, n_cars: int):
         """Set up arrays; `place` puts the others on the road.
 
-        Args:
-            race: how many there are, and how bots drive.
-            lanes: of the courses.
-            tracks: the same courses.
-            n_cars: number of cars.
+        `lanes` are those of the courses `tracks`.
         """
         self._race, self._lanes, self._tracks = race, lanes, tracks
         boxes, bots, count = race.boxes.count, race.bots.count, race.others
@@ -112,10 +108,7 @@ class Others:
     def drive(self, track_index: TrackIndex, time_s: Floats, running: NDArray[np.bool_]) -> None:
         """Move the bots.
 
-        Args:
-            track_index: of each car's course, (N,).
-            time_s: since each episode's begin, (N,).
-            running: cars whose bots have left their starts, (N,).
+        The car's course, the time since its episode's begin, and whether its bots have left their starts are (N,) each.
         """
         if self._paths is not None:
             # Pauses last to the rounding of a control period.
@@ -126,9 +119,7 @@ class Others:
     def pause(self, hit: NDArray[np.bool_], time_s: Floats) -> None:
         """Stop the bots of cars that one of them has hit, unless they stand still already.
 
-        Args:
-            hit: whose bots stop, (N,).
-            time_s: since each episode's begin, (N,).
+        `hit` says whose bots stop, `time_s` is the time since each episode's begin, (N,) each.
         """
         pause_s = self._race.bots.pause_s
         ids = np.flatnonzero(hit & (time_s >= self.resumes_s - _ROUNDING_S))
@@ -190,10 +181,6 @@ class Others:
 
 def check_room(race: RaceConfig, tracks: Sequence[tuple[str, Track]]) -> None:
     """Refuse more boxes or bots than a track has room for.
-
-    Args:
-        race: how many there are.
-        tracks: names and courses.
 
     Raises:
         BadInput: a track is too short, or open, so that bots could not drive round it.

@@ -142,8 +142,8 @@ def number_episodes(
 ) -> tuple[Ints, Mapping[tuple[int, int, int], int]]:
     """Number the episodes of a stream so that no two share a number.
 
-    Of each row: the index of its training, in ascending order, the worker, the number of the episode in the worker's
-    own log, the iteration within its training, and the control step.
+    The arguments have a value a row: the index of its training, in ascending order, the worker, the number of the
+    episode in the worker's own log, the iteration within its training, and the control step.
 
     A single worker keeps its numbers. Episodes of several, which each count from 0, are numbered in the order of
     iteration, worker and own number; the numbers of a training continue those of the one before.
