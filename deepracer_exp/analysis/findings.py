@@ -320,10 +320,10 @@ def _costliest(view: LogView) -> Finding | None:
     if view.others is None:
         return None
     late = thirds(view.steps["iteration"].to_numpy()) == 2
-    found = costliest(view.others, late)
-    if found is None:
+    costs_most = costliest(view.others, late)
+    if costs_most is None:
         return None
-    sentence, values = found
+    sentence, values = costs_most
     return Finding("costs_most", f"In the last third of the iterations: {sentence}", values)
 
 

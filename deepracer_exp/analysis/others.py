@@ -79,28 +79,28 @@ def others_on_road(
     number = steps["episode"].to_numpy()
     first = np.flatnonzero(np.diff(number, prepend=-1) != 0)
     ends = np.append(first[1:], len(steps))
-    known = [place for place, episode in enumerate(number[first].tolist()) if episode in placed]
-    if not known:
+    driven = [place for place, episode in enumerate(number[first].tolist()) if episode in placed]
+    if not driven:
         return None
     crashes: list[pd.DataFrame] = []
     passes: list[pd.DataFrame] = []
-    for begin in range(0, len(known), _EPISODES):
-        some = known[begin : begin + _EPISODES]
+    for begin in range(0, len(driven), _EPISODES):
+        some = driven[begin : begin + _EPISODES]
         rows = np.concatenate([np.arange(first[place], ends[place]) for place in some])
         of_episode = np.repeat(np.arange(len(some)), [ends[place] - first[place] for place in some])
         placements = [placed[int(number[first[place]])] for place in some]
-        found = _met(race, placements, steps.iloc[rows], of_episode, course, period_s)
-        for table, collected in zip(found, (crashes, passes), strict=True):
+        tables = _met(race, placements, steps.iloc[rows], of_episode, course, period_s)
+        for table, collected in zip(tables, (crashes, passes), strict=True):
             collected.append(table.assign(row=rows[table["row"]]))
     boxes = race.boxes.count
     corners, lap_share = np.zeros((0, 4, 2)), np.zeros(0)
-    every = np.stack([placed[int(number[first[place]])][0].places_m[:boxes] for place in known])
-    lanes = np.stack([placed[int(number[first[place]])][0].lanes[:boxes] for place in known])
+    every = np.stack([placed[int(number[first[place]])][0].places_m[:boxes] for place in driven])
+    lanes = np.stack([placed[int(number[first[place]])][0].lanes[:boxes] for place in driven])
     if boxes and np.ptp(every, axis=0).max() < 1e-6 and not np.ptp(lanes, axis=0).any():
         lap_share = every[0] / course.length_m
-        corners = box_corners_of(race, course, placed[int(number[first[known[0]]])][0])
-    names = [f"box {one}" for one in range(1, boxes + 1)]
-    names += [f"bot {one}" for one in range(1, race.bots.count + 1)]
+        corners = box_corners_of(race, course, placed[int(number[first[driven[0]]])][0])
+    names = [f"box {number}" for number in range(1, boxes + 1)]
+    names += [f"bot {number}" for number in range(1, race.bots.count + 1)]
     return OthersOnRoad(
         names=tuple(names),
         boxes=boxes,

@@ -1,6 +1,5 @@
-"""Boxes and bots for the validation of a reward function: where they stand, and the mistakes rewards make with them."""
+"""Boxes and bots for the validation of a reward function: where they stand, and params about them."""
 
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -134,34 +133,3 @@ QUIRKS = {
     "object_in_camera": "documented for the next object, it is that of the one before it, and hardly ever true",
 }
 """Params that the service gives otherwise than its documentation says."""
-
-
-def service_differs(rewards_by_key: dict[str, tuple[Floats, Floats]]) -> Iterator[str]:
-    """Warn of params about others on which the reward depends and that the service gets wrong.
-
-    `rewards_by_key` has for each key of `QUIRKS` the rewards of the same situations with the documented values and with
-    the service's, (n,) each.
-    """
-    for key, (documented, service) in rewards_by_key.items():
-        wrong = int((~np.isclose(documented, service, rtol=1e-6, atol=1e-9)).sum())
-        if wrong:
-            yield (
-                f"{key} decides in {wrong:,} of {len(documented):,} situations, and the service gets it wrong: "
-                f"{QUIRKS[key]} (race.quirks=service does the same)"
-            )
-
-
-def distance_is_relative(near_start: Sequence[float], elsewhere: Sequence[float]) -> Iterator[str]:
-    """Warn if an object half a lap away counts as near because it is near the start line.
-
-    Both are rewards of a car in the middle of the lap: with an object just after the start line, and with one 3 m
-    further, in the same lane.
-    """
-    for near, far in zip(near_start, elsewhere, strict=True):
-        if abs(near - far) > 0.1 * max(abs(near), abs(far)):
-            yield (
-                f"takes objects_distance as the distance from the car: with an object just after the start line, half "
-                f"a lap away, it returns {near:.3g}, with one 3 m further {far:.3g}; objects_distance is counted from "
-                "waypoint 0: compare it with projection_distance"
-            )
-            return

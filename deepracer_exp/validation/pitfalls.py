@@ -1,7 +1,7 @@
 """Warn of common mistakes in reward functions that run without an error; some are measured on driven laps."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -9,10 +9,13 @@ from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.rewards.reward import RewardFunction
 
 from .laps import DrivenLap
+from .objects import QUIRKS, Floats, all_at
 from .probe import Probe
 from .reward_map import RewardGrid
-from .situations import Situations, sample, situations
+from .situations import Situations, near_the_start, quirky, sample, situations
 
+_QUIRKY = 150
+"""Situations in which the service's mistakes are compared with what is documented, at three places of the others."""
 _HELD = 15
 """Steps without moving after which the service ends the episode."""
 _FASTER = 1.1
@@ -168,3 +171,59 @@ def batch_differs(setup: RaceSetup, n: int) -> Iterator[str]:
     if len(wrong):
         first = f"first {paid[wrong[0]]:.6g} instead of {rewards[wrong[0]]:.6g}"
         yield f"reward_batch, which trainings use, differs in {len(wrong)} of {n:,} situations: {first}"
+
+
+def mistakes_with_objects(setup: RaceSetup) -> list[str]:
+    """Return warnings of params about boxes and bots that are taken for what they are not."""
+    text = setup.reward.text
+    pairs = [tuple(float(Probe(setup).rewards(now)[0]) for now in pair) for pair in near_the_start(setup)]
+    near_start, elsewhere = zip(*pairs, strict=True)
+    rewards: dict[str, list[tuple[Floats, Floats]]] = {}
+    for part in range(3):
+        # At other places of the lap: a bot on a straight along the x axis has the same heading in every unit.
+        placed = all_at(setup, part / 3 * setup.track.length_m)
+        # Bots before boxes, so that they are the next ones mostly.
+        placement = replace(placed, places_m=placed.places_m[::-1].copy())
+        for key, (documented, service) in quirky(setup, sample(setup, _QUIRKY), placement).items():
+            if key in text:
+                paid = (Probe(setup).rewards(documented), Probe(setup).rewards(service))
+                rewards.setdefault(key, []).append(paid)
+    joined = {
+        key: (
+            np.concatenate([documented for documented, _ in parts]),
+            np.concatenate([service for _, service in parts]),
+        )
+        for key, parts in rewards.items()
+    }
+    return [*distance_is_relative(near_start, elsewhere), *service_differs(joined)]
+
+
+def service_differs(rewards_by_key: dict[str, tuple[Floats, Floats]]) -> Iterator[str]:
+    """Warn of params about others on which the reward depends and that the service gets wrong.
+
+    `rewards_by_key` has for each key of `QUIRKS` the rewards of the same situations with the documented values and with
+    the service's, (n,) each.
+    """
+    for key, (documented, service) in rewards_by_key.items():
+        wrong = int((~np.isclose(documented, service, rtol=1e-6, atol=1e-9)).sum())
+        if wrong:
+            yield (
+                f"{key} decides in {wrong:,} of {len(documented):,} situations, and the service gets it wrong: "
+                f"{QUIRKS[key]} (race.quirks=service does the same)"
+            )
+
+
+def distance_is_relative(near_start: Sequence[float], elsewhere: Sequence[float]) -> Iterator[str]:
+    """Warn if an object half a lap away counts as near because it is near the start line.
+
+    Both are rewards of a car in the middle of the lap: with an object just after the start line, and with one 3 m
+    further, in the same lane.
+    """
+    for near, far in zip(near_start, elsewhere, strict=True):
+        if abs(near - far) > 0.1 * max(abs(near), abs(far)):
+            yield (
+                f"takes objects_distance as the distance from the car: with an object just after the start line, half "
+                f"a lap away, it returns {near:.3g}, with one 3 m further {far:.3g}; objects_distance is counted from "
+                "waypoint 0: compare it with projection_distance"
+            )
+            return

@@ -30,7 +30,7 @@ from . import pitfalls
 from .aws_dry_run import dry_run_findings
 from .aws_rules import AwsFinding, text_findings
 from .laps import action_space_laps
-from .objects import all_at, distance_is_relative, service_differs, with_others
+from .objects import with_others
 from .pitfalls import LapReturn
 from .probe import NOT_CALLED, Answer, Coverage, Probe, never_executed
 from .reward_map import RewardGrid, State, draw_reward_map, sample_reward_grid, state_of
@@ -38,8 +38,6 @@ from .situations import (
     NamedSituation,
     Situations,
     named_situations,
-    near_the_start,
-    quirky,
     sample,
     seam,
     situations,
@@ -58,8 +56,6 @@ _DETAILS = ((0.3e-3, 1.0), (3e-3, 0.5), (30e-3, 0.25))
 """Resolution of the map by CPU seconds per call."""
 _CARS = 128
 """Default cars of a process."""
-_QUIRKY = 150
-"""Situations in which the service's mistakes are compared with what is documented."""
 _SLOW_S = 1e-3
 """CPU seconds per call; with a fast reward, a step of these cars takes about 2 ms (`benchmarks.throughput`)."""
 
@@ -227,37 +223,12 @@ def look_closer(check: Check) -> None:
     if constant:  # the other warnings would only repeat it
         return
     if setup.others is not None:
-        check.warnings += _mistakes_with_objects(setup)
+        check.warnings += pitfalls.mistakes_with_objects(setup)
     laps = action_space_laps(setup)
     check.warnings += pitfalls.pays_off_the_road(check.grid)
     check.warnings += pitfalls.pays_for_standing(setup, laps)
     check.laps = pitfalls.lap_returns(setup, laps, check.discount)
     check.warnings += pitfalls.slow_laps_return_as_much(check.laps, check.discount)
-
-
-def _mistakes_with_objects(setup: RaceSetup) -> list[str]:
-    """Return warnings of params about boxes and bots that are taken for what they are not."""
-    text = setup.reward.text
-    pairs = [tuple(float(Probe(setup).rewards(now)[0]) for now in pair) for pair in near_the_start(setup)]
-    near_start, elsewhere = zip(*pairs, strict=True)
-    rewards: dict[str, list[tuple[NDArray[np.float64], NDArray[np.float64]]]] = {}
-    for part in range(3):
-        # At other places of the lap: a bot on a straight along the x axis has the same heading in every unit.
-        placed = all_at(setup, part / 3 * setup.track.length_m)
-        # Bots before boxes, so that they are the next ones mostly.
-        placement = replace(placed, places_m=placed.places_m[::-1].copy())
-        for key, (documented, service) in quirky(setup, sample(setup, _QUIRKY), placement).items():
-            if key in text:
-                paid = (Probe(setup).rewards(documented), Probe(setup).rewards(service))
-                rewards.setdefault(key, []).append(paid)
-    joined = {
-        key: (
-            np.concatenate([documented for documented, _ in parts]),
-            np.concatenate([service for _, service in parts]),
-        )
-        for key, parts in rewards.items()
-    }
-    return [*distance_is_relative(near_start, elsewhere), *service_differs(joined)]
 
 
 def _execute_scenes(probe: Probe, check: Check) -> tuple[Coverage, int]:
