@@ -20,10 +20,11 @@ from deepracer_exp.aws.worlds.catalogue import find_world
 from deepracer_exp.errors import BadInput, Unknown, nearest, reading
 
 from . import acting, custom_files
-from .custom_files import FileOverrides, file_overrides, read_custom_files
+from .custom_files import read_custom_files
 from .dimension import range_length
 from .evaluation import EvaluateConfig, EvaluationConfig
 from .experiment import Experiment
+from .file_overrides import FileOverrides, file_overrides
 from .learning import of_ppo_alone
 from .option_files import change, composed, composed_option, first_line, plain
 from .options import groups, listed, options

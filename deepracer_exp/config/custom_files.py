@@ -1,4 +1,4 @@
-"""The files of a DeepRacer model and of deepracer-for-cloud as overrides (`custom_files=DIR`)."""
+"""The files of a DeepRacer model and of deepracer-for-cloud, read from a folder (`custom_files=DIR`)."""
 
 import os
 import re
@@ -18,8 +18,7 @@ from deepracer_exp.aws.models.model_metadata import (
 )
 from deepracer_exp.errors import BadInput
 
-from .job_overrides import job_overrides
-from .overrides import first_given, override_line
+from .overrides import override_line
 
 KEY = "custom_files"
 
@@ -322,124 +321,6 @@ def _workers(folder: str, names: Sequence[str]) -> tuple[tuple[JobSettings, ...]
         shown = " ".join(str(path).split())
         unused.append(f"experiments/{' '.join(path.name.split())}: not used; {KEY}={shown} trains it")
     return workers, unused
-
-
-@dataclass(frozen=True)
-class FileOverrides:
-    """The overrides that a folder of files stands for; the user's own have priority over them."""
-
-    lines: tuple[str, ...]
-    names: Mapping[str, str]
-    """Display names of the reward and the action space that come from the folder."""
-    notes: tuple[str, ...]
-    """What was used, and what was not and why, a line each."""
-
-
-def file_overrides(files: CustomFiles, typed: Mapping[str, str]) -> FileOverrides:
-    """Turn files into overrides.
-
-    `typed` has the user's own overrides by key or group; they have priority.
-    """
-    lines: list[str] = []
-    names: dict[str, str] = {}
-    notes = [
-        f"{KEY}={files.folder}: {', '.join(os.path.relpath(p, files.folder) for p in files.paths.values())}"
-    ]
-
-    reward = files.paths.get("reward_function.py")
-    if reward is not None:
-        winner = first_given(typed, "reward", "reward.name", "reward.file")
-        if winner is None:
-            names["reward"] = files.name
-            lines += [override_line("reward.file", reward), override_line("reward.name", files.name)]
-            notes.append(f"{Path(reward).name}: used as reward.file")
-        else:
-            notes.append(f"{Path(reward).name}: not used, because of {winner}")
-
-    if files.action_space:
-        winner = first_given(typed, "action_space", "action_space.kind", "action_space.file")
-        if winner is None:
-            # Values instead of the file's path, so that config.yaml lists the actions without the file.
-            values = dict(files.action_space)
-            lines.append(f"action_space={values.pop('kind')}")
-            lines += [override_line(f"action_space.{key}", value) for key, value in values.items()]
-            names["action_space"] = files.name
-            many = f"{len(values['actions'])} actions" if "actions" in values else "continuous"
-            notes.append(f"model_metadata.json: used as action_space: {many}")
-        else:
-            notes.append(f"model_metadata.json: action_space: not used, because of {winner}")
-
-    car, applied = car_override(files, typed)
-    lines += car
-    notes += applied
-
-    taken = []
-    if files.is_sac:
-        winner = first_given(typed, "algorithm")
-        if winner is None:
-            lines.append(override_line("algorithm", SAC_OPTION))
-            taken.append(f"algorithm={SAC_OPTION}")
-        else:
-            notes.append(f"training_algorithm=sac: not used, because of {winner}")
-    for key, value in files.learning.items():
-        target = files.taken[key]
-        group = target.partition(".")[0]
-        winner = first_given(typed, group, target)
-        if key == "num_episodes_between_training":
-            frames = typed.get(FRAMES)
-            if frames is not None and frames != f"{FRAMES}=null":
-                winner = winner or frames
-            elif group not in typed:
-                lines.append(override_line(FRAMES, None))
-        if winner is None:
-            taken.append(f"{target}={value}")
-            lines.append(override_line(target, value))
-        else:
-            notes.append(f"hyperparameters.json: {key}={value}: not used, because of {winner}")
-    if taken:
-        source = (
-            "hyperparameters.json" if files.hyperparameters else "model_metadata.json: training_algorithm=sac"
-        )
-        notes.append(f"{source}: used as {', '.join(taken)}")
-    job, applied = job_overrides(files.workers, typed)
-    notes += [*applied, *_left(files, typed)]
-    return FileOverrides(tuple([*lines, *job]), names, (*notes, *files.remarks()))
-
-
-def car_override(files: CustomFiles, typed: Mapping[str, str]) -> tuple[list[str], list[str]]:
-    """Return the override for the car of a model, unless the user chose another, and a note; none without a version."""
-    if files.car is None or files.metadata is None:
-        return [], []
-    winner = first_given(typed, "car", "car.name")
-    used = f"used as car={files.car}" if winner is None else f"not used, because of {winner}"
-    lines = [override_line("car", files.car)] if winner is None else []
-    return lines, [f"model_metadata.json: version={files.metadata.version}: {used}"]
-
-
-def _left(files: CustomFiles, typed: Mapping[str, str]) -> list[str]:
-    """Return a line for each file that is not used."""
-    notes = list(files.unused)
-    for name, (wanted, others) in files.left.items():
-        group, key = _CHOSEN_BY[name]
-        winner = wanted if name in files.paths else first_given(typed, group, key)
-        # A file's name may contain line breaks.
-        shown = ", ".join(" ".join(os.path.relpath(path, files.folder).split()) for path in others)
-        if winner is None:
-            raise BadInput(
-                f"{KEY} {files.folder}: holds {shown or 'none'} but no {wanted}; accepted: one file of that name, or "
-                f"{key}=... beside it"
-            )
-        if shown:
-            notes.append(f"{shown}: not used, because of {winner}")
-    return notes
-
-
-_CHOSEN_BY = {
-    "reward_function.py": ("reward", "reward.file"),
-    "model_metadata.json": ("action_space", "action_space.file"),
-    "hyperparameters.json": ("algorithm", "algorithm"),
-}
-"""The user's own overrides that stand for a file."""
 
 
 def _unknown(keys: Iterable[str], used: Iterable[str]) -> Iterable[tuple[str, str]]:

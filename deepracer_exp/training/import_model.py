@@ -17,13 +17,13 @@ from deepracer_exp.config.custom_files import (
     KEY,
     PLACES,
     CustomFiles,
-    car_override,
     network_overrides,
     read_custom_files,
     sensor_overrides,
     services_network,
 )
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.file_overrides import car_override
 from deepracer_exp.config.imported_options import import_files, remove_options
 from deepracer_exp.config.job_overrides import job_overrides, several_of
 from deepracer_exp.config.learning import CNNConfig
