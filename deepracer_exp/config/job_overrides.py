@@ -3,20 +3,24 @@
 import re
 from collections.abc import Iterator, Mapping, Sequence
 
-from deepracer_exp.aws.models.job_settings import FILE_KEYS, JobSettings
+from deepracer_exp.aws.models.job_settings import FILE_KEYS, H2B_KEYS, OA_KEYS, JobSettings
 from deepracer_exp.aws.worlds.catalogue import find_world, worlds
 from deepracer_exp.aws.worlds.routes import runs_clockwise, world_rows
 from deepracer_exp.errors import BadInput, nearest
 
+from .job_race import race_overrides
 from .overrides import first_given, key_of, override_line
 
+_SECOND_CAR = ("HEAD_TO_MODEL", "F1")
+"""Types of race against models of others; the service takes their number from elsewhere."""
 _DEFAULT_ADVANCE = 0.05
 """The service's, where the start changes and the file does not say by how much."""
 _NOT_APPLICABLE = {
     r"DR_TRAIN_(MIN_EVAL|BEST|MAX_STEPS|RTF)|MIN_EVAL_TRIALS|BEST_MODEL_METRIC": "not applicable: how the service "
     "evaluates and batches; here values of evaluation, checkpoints and algorithm",
     r"DR_EVAL_": "not applicable: for evaluations; here `deepracer-exp evaluate RUN evaluation=NAME`",
-    r"DR_(OA|H2B)_": "not applied: here race=NAME and its keys choose boxes and bots",
+    r"DR_OA_": "not read, because DR_RACE_TYPE is not OBJECT_AVOIDANCE",
+    r"DR_H2B_": "not read, because DR_RACE_TYPE is not HEAD_TO_BOT",
     r"": "no effect on a training here: names, colours, places and parts of the service",
 }
 """Keys that have no effect here, the first pattern that matches, and why."""
@@ -56,6 +60,9 @@ def job_overrides(workers: Sequence[JobSettings], typed: Mapping[str, str]) -> t
                 lines.append(override_line(target, value % 1.0 if target.endswith("offset") else value))
             else:
                 notes.append(f"{first.name}: {target}={value:g}: not used, because of {winner}")
+    race, remarks = race_overrides(first, typed)
+    lines += race
+    notes += [f"{first.name}: {remark}" for remark in remarks]
     if lines:
         notes.insert(0, f"{files}: used as {', '.join(lines)}".replace("'", ""))
     notes += [f"{name}: {what}" for name, what in _remarks(workers)]
@@ -116,9 +123,13 @@ def _remarks(workers: Sequence[JobSettings]) -> Iterator[tuple[str, str]]:
     first = workers[0]
     for worker in workers:
         key = worker.keys["RACE_TYPE"]
-        if worker.race_type != "TIME_TRIAL":
-            alone = "the car drives alone; here race=NAME and its keys choose boxes and bots"
+        if worker.race_type in _SECOND_CAR:
+            alone = (
+                "it needs the model of another; here race=head_to_head races against snapshots or another run"
+            )
             yield worker.name, f"{key}={worker.race_type}: not applied: {alone}"
+        if (worker.race_type, worker.race) != (first.race_type, first.race):
+            yield worker.name, f"{key} and boxes or bots: not applied: all cars race as those of {first.name}"
         if (worker.start_advance, worker.start_offset, worker.changes_start) != (
             first.start_advance,
             first.start_offset,
@@ -132,7 +143,7 @@ def _remarks(workers: Sequence[JobSettings]) -> Iterator[tuple[str, str]]:
     if first.is_pretrained:
         fresh = "the training starts fresh; `deepracer-exp import MODEL` and `clone` continue one"
         yield first.name, f"{first.keys['PRETRAINED']}=True: not applied: {fresh}"
-    read = {*first.keys.values(), *FILE_KEYS.values(), "TRACK_DIRECTION_CLOCKWISE"}
+    read = {*first.keys.values(), *FILE_KEYS.values(), "TRACK_DIRECTION_CLOCKWISE", *_race_keys(first)}
     unused: dict[str, list[str]] = {}
     for key in dict.fromkeys(key for worker in workers for key in worker.set_keys if key not in read):
         why = next(why for pattern, why in _NOT_APPLICABLE.items() if re.match(pattern, key))
@@ -147,6 +158,14 @@ def _remarks(workers: Sequence[JobSettings]) -> Iterator[tuple[str, str]]:
             for start, some in alike.items()
         ]
         yield first.name, f"{', '.join(shown)}: {why}"
+
+
+def _race_keys(job: JobSettings) -> tuple[str, ...]:
+    """Return the file's keys about boxes and bots that are read in its type of race."""
+    if not job.is_env:
+        return (*OA_KEYS, *H2B_KEYS)
+    keys = {"OBJECT_AVOIDANCE": OA_KEYS, "HEAD_TO_BOT": H2B_KEYS}.get(job.race_type, {})
+    return tuple(keys.values())
 
 
 def _beginning(key: str) -> str:

@@ -111,8 +111,7 @@ def test_each_key_is_used_or_named_with_the_reason(drfc):
 @pytest.mark.parametrize(
     ("key", "value", "word"),
     [
-        ("DR_RACE_TYPE", "OBJECT_AVOIDANCE", "the car drives alone"),
-        ("DR_RACE_TYPE", "head_to_bot", "the car drives alone"),
+        ("DR_RACE_TYPE", "HEAD_TO_MODEL", "race=head_to_head"),
         ("DR_ENABLE_DOMAIN_RANDOMIZATION", "True", "randomization=sim2real"),
         ("DR_LOCAL_S3_PRETRAINED", "True", "the training starts fresh"),
     ],
@@ -141,7 +140,10 @@ def test_workers_with_files_of_their_own_are_several_tracks(drfc):
         "2022_april_open": ("reversed", 1.0),
     }
     assert "worker-5.env: starts: not applied: all cars start as those of run.env" in notes
-    assert any(note.startswith("worker-3.env: DR_RACE_TYPE=HEAD_TO_BOT: not applied") for note in notes)
+    assert any(
+        note.startswith("worker-3.env: DR_RACE_TYPE and boxes or bots: not applied: all cars race as those")
+        for note in notes
+    )
     # The user's own values have priority, of one track and of all.
     experiment, notes = composed(folder, "track=Oval_track", "track.direction=reversed")
     assert {name: track.direction for name, track in experiment.tracks.items()} == {"Oval_track": "reversed"}

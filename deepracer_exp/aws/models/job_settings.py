@@ -24,6 +24,26 @@ ENV_KEYS = {
 
 The last two are of run.env alone.
 """
+OA_KEYS = {
+    "NUMBER_OF_OBSTACLES": "DR_OA_NUMBER_OF_OBSTACLES",
+    "MIN_DISTANCE_BETWEEN_OBSTACLES": "DR_OA_MIN_DISTANCE_BETWEEN_OBSTACLES",
+    "RANDOMIZE_OBSTACLE_LOCATIONS": "DR_OA_RANDOMIZE_OBSTACLE_LOCATIONS",
+    "IS_OBSTACLE_BOT_CAR": "DR_OA_IS_OBSTACLE_BOT_CAR",
+    "OBSTACLE_TYPE": "DR_OA_OBSTACLE_TYPE",
+    "OBJECT_POSITIONS": "DR_OA_OBJECT_POSITIONS",
+}
+H2B_KEYS = {
+    "NUMBER_OF_BOT_CARS": "DR_H2B_NUMBER_OF_BOT_CARS",
+    "MIN_DISTANCE_BETWEEN_BOT_CARS": "DR_H2B_MIN_DISTANCE_BETWEEN_BOT_CARS",
+    "RANDOMIZE_BOT_CAR_LOCATIONS": "DR_H2B_RANDOMIZE_BOT_CAR_LOCATIONS",
+    "BOT_CAR_SPEED": "DR_H2B_BOT_CAR_SPEED",
+    "IS_LANE_CHANGE": "DR_H2B_IS_LANE_CHANGE",
+    "LOWER_LANE_CHANGE_TIME": "DR_H2B_LOWER_LANE_CHANGE_TIME",
+    "UPPER_LANE_CHANGE_TIME": "DR_H2B_UPPER_LANE_CHANGE_TIME",
+    "LANE_CHANGE_DISTANCE": "DR_H2B_LANE_CHANGE_DISTANCE",
+    "PENALTY_SECONDS": "DR_H2B_BOT_CAR_PENALTY",
+}
+"""Keys of training_params.yaml about boxes and bots, and deepracer-for-cloud's for the same values."""
 RACE_TYPES = ("TIME_TRIAL", "OBJECT_AVOIDANCE", "HEAD_TO_BOT", "HEAD_TO_MODEL", "HEAD_TO_HEAD_RACING", "F1")
 FILE_KEYS = {
     "reward_function.py": "DR_LOCAL_S3_REWARD_KEY",
@@ -61,6 +81,10 @@ class JobSettings:
     """Whether each worker has a file of its own (run.env)."""
     is_pretrained: bool
     """Whether the training continues that of another model (run.env)."""
+    is_env: bool
+    """Whether the file is of deepracer-for-cloud, which reads keys about boxes and bots by the type of the race."""
+    race: Mapping[str, str]
+    """Values about boxes and bots, by the keys `OA_KEYS` and `H2B_KEYS`, as they stand there."""
     files: Mapping[str, str]
     """Names of the three files of a model where run.env chooses others than the usual ones."""
 
@@ -105,6 +129,12 @@ def read_training_params(path: str) -> tuple[JobSettings, ...]:
     if not isinstance(data, dict):
         raise BadInput(path, "holds no keys", accepted)
     lists = {str(key): value if isinstance(value, list) else [value] for key, value in data.items()}
+    positions = lists.get("OBJECT_POSITIONS")
+    if positions is not None:  # a list already, or one of lists
+        each = positions if any(isinstance(value, list) for value in positions) else [positions]
+        lists["OBJECT_POSITIONS"] = [
+            ";".join(map(str, value if isinstance(value, list) else [value])) for value in each
+        ]
     workers = max(len(lists.get(key, ())) for key in ENV_KEYS)
     same = {key: key for key in ENV_KEYS}
     return tuple(
@@ -175,6 +205,12 @@ def _settings(
         randomizes=bool(truth("ENABLE_DOMAIN_RANDOMIZATION")),
         has_several=bool(truth("MULTI_CONFIG")),
         is_pretrained=bool(truth("PRETRAINED")),
+        is_env=keys is ENV_KEYS,
+        race={
+            name: values[key]
+            for name, env_key in (OA_KEYS | H2B_KEYS).items()
+            if (key := env_key if keys is ENV_KEYS else name) in values
+        },
         # A key in an S3 bucket, often with a variable in front: $DR_LOCAL_S3_CUSTOM_FILES_PREFIX/reward_function.py.
         files={
             name: match[0]
