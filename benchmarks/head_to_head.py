@@ -34,6 +34,8 @@ from .command import trained
 from .report import benchmark_parser, number, table, with_exit_code, write_json
 
 WANTED = 0.7
+TIME_S = 60.0
+"""Duration of a race that nobody finishes: a policy that has learned nothing finishes none."""
 _KEPT = ("experiment=head_to_head", "checkpoints.keep=1000", "report=false", "tracking=off")
 
 
@@ -66,7 +68,7 @@ def measure(run: StoredRun, races: int) -> dict[str, Any]:
     """Race the last policy of a finished run against the earlier ones."""
     torch.set_num_threads(1)
     config = compose_evaluation(["evaluation=head_to_head"])[0].evaluation
-    evaluator = Evaluator(run.experiment, replace(config, trials=races, time_s=120.0))
+    evaluator = Evaluator(run.experiment, replace(config, trials=races, time_s=TIME_S))
     last = run.with_policy("last").read_policy()
     figures = {"began": race(evaluator, last.networks.policy, first_policy(run.experiment))}
     names = [path.name for path in sorted(run.checkpoints.glob("[0-9]*")) if path.name < last.path.name]

@@ -1,9 +1,12 @@
 import json
 
+import pytest
+
 from benchmarks import head_to_head
 from tests.conftest import IN_PROCESS
 
 
+@pytest.mark.slow
 def test_a_policy_races_against_the_one_it_began_with_and_those_on_the_way(tmp_path):
     options = ["--races", "2", "--work", str(tmp_path), "--json", str(tmp_path / "figures.json")]
     small = (
