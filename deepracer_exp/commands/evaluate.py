@@ -143,6 +143,11 @@ def _planned(
     return plan
 
 
+def _refuse_rival(plan: "EvaluatePlan", flag: str) -> None:
+    if plan.config.rival is not None:
+        raise BadInput(f"rival={plan.config.rival}", f"{flag} shows races of a policy against itself", "null")
+
+
 def _checkpoints_given(args: argparse.Namespace) -> list[str]:
     return [override for override in runs_and_overrides(args)[1] if override.startswith("checkpoint=")]
 
@@ -180,12 +185,13 @@ def _watch(args: argparse.Namespace) -> int:
 
         file = None if args.output is None else Path(args.output)
         with warnings_on_stderr():
-            film_run(plan.run, plan.config.evaluation, file, Console(), Console(stderr=True))
+            film_run(plan.run, plan.config.evaluation, file, Console(), Console(stderr=True), plan.rival)
         return 0
     from deepracer_exp.reports.live_server import LiveServer
 
     # Its first checkpoint may be still to come.
     plan = _planned(args, run, overrides, has_checkpoint=False)
+    _refuse_rival(plan, "--live")
     with LiveServer(args.port or 0) as server, warnings_on_stderr():
         print(server.url, flush=True)
 
@@ -208,6 +214,7 @@ def _replay_laps(args: argparse.Namespace) -> int:
             f"{' '.join(runs) or 'RUN'}: {len(runs)} given; accepted: a run, and another one or logs"
         )
     plan, rival, view = _planned(args, runs[0], overrides), None, None
+    _refuse_rival(plan, "--replay")
     if runs[1:]:
         from deepracer_exp.runs.files import is_run
 
@@ -285,7 +292,9 @@ def _checkpoints(args: argparse.Namespace) -> int:
 
     progress = Console(stderr=True, highlight=False, markup=False)
     with warnings_on_stderr():
-        show_checkpoints(plan.run, plan.training_protocol, args.output, table_console(160), progress)
+        show_checkpoints(
+            plan.run, plan.training_protocol, args.output, table_console(160), progress, plan.rival
+        )
     return 0
 
 

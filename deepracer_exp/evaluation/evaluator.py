@@ -22,6 +22,7 @@ from deepracer_exp.env.real_car import as_the_car, require_car
 from deepracer_exp.env.setup import Course, build_setup
 from deepracer_exp.env.trace import PACKED, STATUS_CODE
 from deepracer_exp.errors import BadInput
+from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.rewards.source import NO_REWARD
 from deepracer_exp.tracks.track import directed_tracks
 
@@ -57,6 +58,7 @@ class Evaluator:
     Attributes:
         trials: one for each row of the batch.
         race: the cars.
+        rival: drives the other car of a race head to head, where a call names no other; None: the policy itself.
     """
 
     def __init__(
@@ -112,6 +114,7 @@ class Evaluator:
         )
         self._course = np.array([trial.course for trial in self.trials])
         self._start_ndist = np.array([trial.start_ndist for trial in self.trials])
+        self.rival: torch.nn.Module | None = None
         self._closed = np.array([courses[trial.course].tracks[0].closed for trial in self.trials])
 
     def __call__(
@@ -122,7 +125,7 @@ class Evaluator:
         Args:
             policy: reads what the experiment observes, writes `action`.
             on_step: called after every control step.
-            rival: drives the other car of a race head to head; None: the policy itself.
+            rival: drives the other car of a race head to head; None: `self.rival`.
 
         Raises:
             RunFailed: an action or a car's state became NaN or infinite.
@@ -132,7 +135,7 @@ class Evaluator:
         protocol = RaceProtocol(config, self._closed, race.setup.car.control_period_s, among_others)
         rivals = None
         if isinstance(race, HeadToHead):
-            race.drive_with([rival or policy])
+            race.drive_with([rival or self.rival or policy])
             rivals = RivalProtocol(config, self._closed, race.setup.car.control_period_s)
         trace: list[NDArray[np.float64]] = []
         race.seed(config.seed)
@@ -193,6 +196,21 @@ class Evaluator:
         drives = np.isin(status, [STATUS_CODE[word] for word in DRIVES if word]) & (running > 0)
         track = self.race.setup.courses[course].tracks[0]
         return zigzag_of(track, x_m, y_m, steering_deg, time_s, np.zeros(len(rows), np.intp), drives)
+
+
+def evaluator_against(rival: StoredRun | None, experiment: Experiment, config: EvaluationConfig) -> Evaluator:
+    """Build an evaluator whose policies race against a stored one where the race is head to head.
+
+    `rival` is the run with its checkpoint; None: each policy races against itself. The rest is as for `Evaluator`.
+
+    Raises:
+        BadInput: as for `Evaluator`, or the checkpoint cannot be used.
+    """
+    if rival is None:
+        return Evaluator(experiment, config)
+    evaluator = Evaluator(experiment, config, rival_sees=rival.experiment.observation)
+    evaluator.rival = rival.read_policy().networks.policy
+    return evaluator
 
 
 def tracks_of(experiment: Experiment, config: EvaluationConfig) -> dict[str, TrackConfig]:

@@ -17,7 +17,7 @@ from deepracer_exp.analysis.log_tables import Table as PageTable
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.errors import BadInput, count, writing
 from deepracer_exp.evaluation.evaluate import fit
-from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.evaluation.evaluator import Evaluator, evaluator_against
 from deepracer_exp.evaluation.result import (
     CONFIDENCE,
     HELD_OUT,
@@ -245,9 +245,16 @@ _LEGEND = (
 
 
 def show_checkpoints(
-    run: StoredRun, protocol: EvaluationConfig, picture: str | None, out: Console, err: Console
+    run: StoredRun,
+    protocol: EvaluationConfig,
+    picture: str | None,
+    out: Console,
+    err: Console,
+    rival: StoredRun | None = None,
 ) -> None:
     """Evaluate a run's checkpoints, print the comparison, recommend one, and draw them on the page `picture`.
+
+    `rival` is as for `evaluator_against`.
 
     Raises:
         BadInput: all its checkpoints, a track or a condition cannot be used, or a file cannot be written.
@@ -260,7 +267,7 @@ def show_checkpoints(
         if link.is_symlink() and not link.exists():
             logger.warning("%s is a broken link", link)
     torch.set_num_threads(1)
-    evaluator = Evaluator(run.experiment, protocol)
+    evaluator = evaluator_against(rival, run.experiment, protocol)
     err.print(
         f"{run.path.name}: {count(len(kept), 'checkpoint')}, {count(len(evaluator.trials), 'trial')} each",
         soft_wrap=True,

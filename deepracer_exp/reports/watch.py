@@ -21,7 +21,7 @@ from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.env.action_space import ActionSpace, DiscreteActions
 from deepracer_exp.env.lidar import reach_of_rays
 from deepracer_exp.errors import RunFailed, count, writing
-from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.evaluation.evaluator import evaluator_against
 from deepracer_exp.evaluation.film import Lap, drive_best_lap, in_frames, write_film
 from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.files import FILMS
@@ -274,11 +274,17 @@ class _Distribution:
 
 
 def film_run(
-    run: StoredRun, protocol: EvaluationConfig, file: Path | None, out: Console, err: Console
+    run: StoredRun,
+    protocol: EvaluationConfig,
+    file: Path | None,
+    out: Console,
+    err: Console,
+    rival: StoredRun | None = None,
 ) -> None:
     """Race a run's checkpoint under a protocol and film its fastest lap on the usual conditions.
 
-    `file` is the .mp4 to write; None: named after the checkpoint, in the run's folder.
+    `file` is the .mp4 to write; None: named after the checkpoint, in the run's folder. `rival` is as for
+    `evaluator_against`.
 
     Raises:
         BadInput: the checkpoint, a track or a condition cannot be used.
@@ -286,7 +292,7 @@ def film_run(
     """
     stored = run.read_policy()
     torch.set_num_threads(1)
-    evaluator = Evaluator(run.experiment, replace(protocol, held_out=None))
+    evaluator = evaluator_against(rival, run.experiment, replace(protocol, held_out=None))
     err.print(
         f"{run.path.name}, checkpoint {stored.path.name}: {count(len(evaluator.trials), 'trial')}",
         highlight=False,

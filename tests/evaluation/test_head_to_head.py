@@ -128,3 +128,10 @@ def test_a_rival_that_cannot_race_is_refused_in_one_line(copied, call):
         (("evaluation=head_to_head", "rival_checkpoint=last"), ("rival_checkpoint=last", "rival=RUN")),
     ):
         call("evaluate", run.name, *overrides).assert_refused(*words)
+
+
+def test_pages_of_a_policy_against_itself_take_no_rival(copied, call):
+    run = copied("race=head_to_head", "observation.next_objects=1")
+    for flags in (("--live",), ("--replay", "laps.html")):
+        ended = call("watch", run.name, "evaluation=head_to_head", f"rival={run.name}", *flags)
+        ended.assert_refused("rival=", flags[0], "against itself")
