@@ -59,7 +59,7 @@ class InnerLoop:
     def fits(networks: ActorCritic) -> bool:
         """Return whether the networks are perceptrons that share nothing, as `build_actor_critic` makes them."""
         heads = (_policy_layers(networks)[0], networks.value_head.module)
-        return networks.trunk is None and all(map(_is_plain, heads))
+        return networks.trunk is None and all(map(is_plain, heads))
 
     def run(self, columns: Sequence[Tensor], size: int, lr: float, entropy_coeff: float) -> Tensor:
         """Make the gradient steps of an epoch in place.
@@ -117,7 +117,7 @@ class InnerLoop:
         return tuple(zip(*rows, strict=True)), int(adam["step"])
 
 
-def _is_plain(layers: nn.Module) -> bool:
+def is_plain(layers: nn.Module) -> bool:
     """Return whether layers are linear with biases, one kind of activation between them and none at the end."""
     if type(layers) is not MLP:  # a class of the user's own may compute anything
         return False

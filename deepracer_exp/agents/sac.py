@@ -16,6 +16,7 @@ from deepracer_exp.errors import RunFailed
 from .actor_critic import PolicyNetworks
 from .algorithm import Algorithm, UpdateMetrics, require_finite
 from .replay import Replay
+from .sac_losses import SACLosses
 from .schedules import Schedule
 from .soft_actor_critic import SoftActorCritic
 
@@ -77,6 +78,10 @@ class SAC(Algorithm):
         self._learner = networks if device == _CPU else copy.deepcopy(networks).to(device)
         self._loss = self._build_loss()
         self._loss.make_value_estimator(gamma=config.discount)
+        fits = SACLosses.fits(self._learner)
+        self._losses: SACLosses | SACLoss | DiscreteSACLoss = (
+            SACLosses(self._learner, self._loss, config) if fits else self._loss
+        )
         self._targets: SoftUpdate | HardUpdate
         if config.tau is None:  # copies whenever it is asked to
             self._targets = HardUpdate(self._loss, value_network_update_interval=0)
@@ -196,11 +201,11 @@ class SAC(Algorithm):
         size = min(self.config.batch_size, 1 << (len(self.replay).bit_length() - 1))
         if first and self.config.tau is None:
             self._targets.step()
-        losses = self._loss(self.replay.sample(size).to(self._device))
+        losses = self._losses(self.replay.sample(size).to(self._device))
         names = [
             name for name in _LOSSES if name in losses and (name != "loss_alpha" or self.config.learn_alpha)
         ]
-        loss = sum(losses[name] for name in names)
+        loss = torch.stack([losses[name] for name in names]).sum()
         self._optimizer.zero_grad()
         loss.backward()
         grad_norm = nn.utils.get_total_norm(
@@ -219,7 +224,7 @@ class SAC(Algorithm):
             [losses["loss_actor"].detach(), losses["loss_qvalue"].detach(), entropy, q_value, grad_norm]
         )
 
-    def _fail(self, losses: TensorDictBase, names: list[str]) -> NoReturn:
+    def _fail(self, losses: TensorDictBase | dict[str, Tensor], names: list[str]) -> NoReturn:
         """Raise RunFailed with the first thing that is not finite."""
         for name in names:
             if not torch.isfinite(losses[name]):
