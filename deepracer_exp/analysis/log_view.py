@@ -24,7 +24,7 @@ from .log_course import (
     numbered_as_logged,
     was_driven_on,
 )
-from .others import OthersOnRoad, others_on_road
+from .others import OthersOnRoad, others_of_log, others_on_road
 from .step_columns import add_derived, first_rows, timed_by_service
 from .tables import candidates, episode_table, iteration_table
 
@@ -80,6 +80,8 @@ class LogView:
     def boxes_of(self, episode: int) -> NDArray[np.float64]:
         """Return the corners of the boxes of an episode of `steps`, (k, 4, 2); none where these are not known."""
         run, course = self.run, self.course
+        if run is None and self.others is not None:
+            return self.others.corners
         if run is None or run.race is None or course is None:
             return np.zeros((0, 4, 2))
         placed = run.placed.get(course.reversed, {}).get(episode)
@@ -265,13 +267,19 @@ def prepare(log: Recording | RunRecording, track: str | None = None) -> LogView:
         laps_timed=timed + races_timed,
         problems=(*recording.problems, *problems),
         discount=discount,
-        others=_others(run, trained, course),
+        others=_others(recording, run, trained, course),
         run=run,
     )
 
 
-def _others(run: RunRecording | None, steps: pd.DataFrame, course: Track | None) -> OthersOnRoad | None:
-    if run is None or run.race is None or course is None:
+def _others(
+    recording: Recording, run: RunRecording | None, steps: pd.DataFrame, course: Track | None
+) -> OthersOnRoad | None:
+    if course is None:
+        return None
+    if run is None:
+        return others_of_log(recording, steps, course)
+    if run.race is None:
         return None
     return others_on_road(run.race, run.placed.get(course.reversed, {}), steps, course, run.period_s)
 

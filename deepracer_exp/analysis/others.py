@@ -7,8 +7,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from deepracer_exp.aws.logs.recording import Recording
+from deepracer_exp.config.job_race import recorded_race
 from deepracer_exp.config.race import RaceConfig
-from deepracer_exp.env.placement import Placement, box_corners_of, rebuild_poses
+from deepracer_exp.env.placement import Placement, box_corners_of, draw_placements, rebuild_poses
+from deepracer_exp.errors import BadInput
+from deepracer_exp.runs.recording import CONTROL_PERIOD_S
 from deepracer_exp.sim.collisions import BOX_M, CAR_M, first_hit
 from deepracer_exp.tracks.track import Track
 
@@ -18,6 +22,8 @@ ORIGIN_BEHIND_M = 0.14
 """Distance from the logged point, the front of the car, back to its origin (deepracer-simapp)."""
 NEAR_M = 2.0
 """Gap along the lap below which a car that gets past something has passed it, not jumped."""
+_TOUCHED_M = 0.6
+"""Distance between the origins of a car and what it may have run into."""
 _EPISODES = 2000
 """Episodes whose poses are rebuilt together: 100 MB with six others."""
 
@@ -111,6 +117,29 @@ def others_on_road(
     )
 
 
+def others_of_log(recording: Recording, steps: pd.DataFrame, course: Track) -> OthersOnRoad | None:
+    """Return the others around the cars of a log of the service, as far as the parameters of its job say where.
+
+    Bots are driven by the control steps; where one has stopped because it hit the car is not logged.
+
+    Args:
+        recording: with the parameters about boxes and bots.
+        steps: as for `others_on_road`.
+        course: that was driven on.
+    """
+    try:
+        race = recorded_race(recording.race)
+    except BadInput:
+        return None
+    if race is None or (race.bots.count and not course.closed):
+        return None
+    length_m, first = np.array([course.length_m]), np.zeros(1, np.int64)
+    places_m, lanes = draw_placements(race, length_m, first, np.zeros(1, np.uint64))
+    same = Placement(places_m[0], lanes[0], 0), np.zeros(0)
+    placed = dict.fromkeys(steps["episode"].unique().tolist(), same)
+    return others_on_road(race, placed, steps, course, CONTROL_PERIOD_S)
+
+
 def _met(
     race: RaceConfig,
     placements: list[tuple[Placement, Values]],
@@ -137,7 +166,9 @@ def _met(
     half_m = 0.5 * np.where(is_bot[:, None], CAR_M, BOX_M)
     hit = np.asarray(first_hit(*origin, yaw_rad[crashed], lagged, half_m))
     away_m = np.hypot(lagged[..., 0] - origin[0][:, None], lagged[..., 1] - origin[1][:, None])
-    hit = np.where(hit >= 0, hit, away_m.argmin(axis=1))
+    # Recorded poses and boxes are not those of the physics to the last digit.
+    hit = np.where(hit >= 0, hit, np.where(away_m.min(axis=1) < _TOUCHED_M, away_m.argmin(axis=1), -1))
+    crashed, hit = crashed[hit >= 0], hit[hit >= 0]
     length_m = course.length_m
     at_m = course.project(np.column_stack([x, y])).distance_m
     gap_m = np.mod(distance_m - at_m[:, None] + 0.5 * length_m, length_m) - 0.5 * length_m

@@ -2,11 +2,15 @@
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
+
+from pydantic import TypeAdapter
 
 from deepracer_exp.aws.models.job_settings import H2B_KEYS, OA_KEYS, JobSettings
 from deepracer_exp.errors import BadInput
 
 from .overrides import first_given, override_line
+from .race import ALONE, BotsConfig, BoxPosition, RaceConfig
 
 ENV_DEFAULTS = {
     "NUMBER_OF_OBSTACLES": "6",
@@ -34,6 +38,8 @@ _DEFAULTS = {
 """The service's (deepracer-simapp, markov/agent_ctrl/obstacles_agent_ctrl.py and bot_cars_agent_ctrl.py)."""
 _LANES = {"1": "inner", "-1": "outer"}
 _TRUE = ("true", "t", "yes", "y", "on", "1")
+_POSITIONS = TypeAdapter(list[BoxPosition])
+_BOTS = TypeAdapter(BotsConfig)
 _SEES = "observation.next_objects"
 _AS_PER_CENT = (
     "the service takes the distance between boxes for per cent of the lap, and again of its own result; "
@@ -57,7 +63,7 @@ def race_overrides(job: JobSettings, typed: Mapping[str, str]) -> tuple[list[str
     Raises:
         BadInput: a value is none that the service accepts.
     """
-    values = _Values(job)
+    values = _Values(job.file, job.race, job.race_type if job.is_env else None)
     lines: list[str] = []
     notes: list[str] = []
     chosen: dict[str, object] = {}
@@ -87,34 +93,62 @@ def race_overrides(job: JobSettings, typed: Mapping[str, str]) -> tuple[list[str
     return lines, notes
 
 
+def recorded_race(values: Mapping[str, str]) -> RaceConfig | None:
+    """Return the boxes and bots of a recording whose places its parameters say.
+
+    They do of boxes at given positions, and of bots that begin at the same places in every episode and stay in their
+    lanes; the distance by which the service spreads other boxes depends on its version.
+
+    Args:
+        values: of training_params.yaml, `aws.models.job_settings.race_values`.
+
+    Returns:
+        None: there is nobody else on the road, or it is not known where.
+
+    Raises:
+        BadInput: a value is none that the service accepts.
+    """
+    job = _Values("training_params.yaml", values)
+    boxes, bots = ALONE.boxes, ALONE.bots
+    if job.text("OBJECT_POSITIONS"):
+        positions = tuple(_POSITIONS.validate_python(job.positions()))
+        boxes = replace(boxes, placement="fixed", positions=positions)
+    if job.has_bots and not job.truth("RANDOMIZE_BOT_CAR_LOCATIONS") and not job.truth("IS_LANE_CHANGE"):
+        chosen = {key.removeprefix("race.bots."): value for key, value in _bots(job).items()}
+        bots = _BOTS.validate_python(chosen)
+    race = replace(ALONE, boxes=boxes, bots=bots)
+    return race if race.others else None
+
+
 class _Values:
     """The values of a job about boxes and bots, by the keys of training_params.yaml."""
 
-    def __init__(self, job: JobSettings):
-        self._job = job
-        self._defaults = _DEFAULTS | (ENV_DEFAULTS if job.is_env else {})
+    def __init__(self, file: str, race: Mapping[str, str], race_type: str | None = None):
+        """Take the values of a file; `race_type` is that of deepracer-for-cloud, None: the file is the service's."""
+        self._file, self._race, self._type = file, race, race_type
+        self._defaults = _DEFAULTS | (ENV_DEFAULTS if race_type is not None else {})
 
     @property
     def has_boxes(self) -> bool:
         """Return whether there are any boxes."""
-        if self._job.is_env and self._job.race_type != "OBJECT_AVOIDANCE":
+        if self._type not in (None, "OBJECT_AVOIDANCE"):
             return False
         return bool(self.text("OBJECT_POSITIONS")) or self.number("NUMBER_OF_OBSTACLES") > 0
 
     @property
     def has_bots(self) -> bool:
         """Return whether there are any bots."""
-        if self._job.is_env and self._job.race_type != "HEAD_TO_BOT":
+        if self._type not in (None, "HEAD_TO_BOT"):
             return False
         return self.number("NUMBER_OF_BOT_CARS") > 0
 
     def key(self, name: str) -> str:
         """Return the file's name of a key."""
-        return (OA_KEYS | H2B_KEYS)[name] if self._job.is_env else name
+        return (OA_KEYS | H2B_KEYS)[name] if self._type is not None else name
 
     def text(self, name: str) -> str:
         """Return a value as text."""
-        return self._job.race.get(name, self._defaults[name])
+        return self._race.get(name, self._defaults[name])
 
     def truth(self, name: str) -> bool:
         """Return a value that is true or false, as the service reads it."""
@@ -132,7 +166,7 @@ class _Values:
         except ValueError:
             number = -1.0
         if not 0 <= number < 1e6:
-            raise BadInput(self._job.file, f"{self.key(name)}={text[:80]}", "a number from 0 up")
+            raise BadInput(self._file, f"{self.key(name)}={text[:80]}", "a number from 0 up")
         return number
 
     def positions(self) -> list[dict[str, object]]:
@@ -148,7 +182,7 @@ class _Values:
             share = float(match[1]) if match and match[1].count(".") < 2 and match[1] != "." else 2.0
             if match is None or share > 1:
                 accepted = "share of the lap and lane, 1 inner or -1 outer: 0.25,1;0.5,-1"
-                raise BadInput(self._job.file, f"{self.key('OBJECT_POSITIONS')}={text[:80]}", accepted)
+                raise BadInput(self._file, f"{self.key('OBJECT_POSITIONS')}={text[:80]}", accepted)
             # A box at the end of the lap is one at its beginning.
             places.append({"lap": share % 1.0, "lane": _LANES[match[2]]})
         return places

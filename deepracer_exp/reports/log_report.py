@@ -78,6 +78,7 @@ RACES: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
     _BESIDE: (),
     "Lap times": (laps.lap_time_histogram, laps.lap_delta),
     "The line it drives": SECTIONS["The line it drives"][:5],
+    "What is on the road": (others.crashes_by_object, others.crash_places, others.overtakes),
     "Where it goes wrong": (mistakes.episode_ends_map,),
     _REWARDED: (),
     "The track": (driving_line.waypoint_map,),

@@ -1,5 +1,8 @@
 """Crashes and passes of a run among boxes and bots, told from its trace and where the others were."""
 
+import dataclasses
+import tarfile
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -8,6 +11,7 @@ from deepracer_exp.analysis.charts.others import crash_free, crash_places, crash
 from deepracer_exp.analysis.findings import findings
 from deepracer_exp.analysis.log_view import prepare
 from deepracer_exp.analysis.others import costliest, others_on_road
+from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.placement import Placement, rebuild_poses
 from deepracer_exp.reports.log_report import LogPage, draw_sections
@@ -86,7 +90,9 @@ def test_a_car_that_drives_a_lap_passes_every_box_once_and_slower_bots():
             "episode_status": "in_progress",
         }
     )
-    steps.loc[count - 1, "episode_status"] = "crashed"
+    # On the centre line, beside the first box; the last row is near nothing, so that nobody knows what it hit.
+    beside = int(np.abs(driven_m - 3.0).argmin())
+    steps.loc[[beside, count - 1], "episode_status"] = "crashed"
     places_m = np.array([3.0, 9.0, 14.0, *np.linspace(2, length_m - 1, 6)])
     drawn = Placement(places_m, np.arange(9) % 2, 3)
     found = others_on_road(experiment.race, {7: (drawn, np.zeros(0))}, steps, track, 1 / 15)
@@ -97,10 +103,40 @@ def test_a_car_that_drives_a_lap_passes_every_box_once_and_slower_bots():
     rows = passed.set_index("other")["row"]
     np.testing.assert_allclose(driven_m[rows[[0, 1, 2]]], places_m[:3], atol=0.4)
     assert (passed["other"] >= 3).sum() >= 3
-    assert found.crashes["row"].tolist() == [count - 1]
+    assert found.crashes[["row", "other"]].to_numpy().tolist() == [[beside, 0]]
     sentence, values = costliest(found, np.ones(count, bool))
     assert values["all_crashes"] == 1
-    assert sentence.startswith(found.names[found.crashes["other"][0]].capitalize())
+    assert sentence.startswith("Box 1 (at 13% of the lap) costs most: 1 of 1 crashes")
     assert costliest(found, np.zeros(count, bool)) is None
     # Another episode is not known.
     assert others_on_road(experiment.race, {8: (drawn, np.zeros(0))}, steps, track, 1 / 15) is None
+
+
+def test_a_log_whose_parameters_say_where_the_boxes_are_is_analysed_as_a_run_among_them(trained):
+    fixed = (
+        *("race=object_avoidance", "race.boxes.placement=fixed", "observation.next_objects=2"),
+        "race.boxes.positions=[{lap: 0.3, lane: inner}, {lap: 0.6, lane: outer}]",
+        "track=reInvent2019_track",
+    )
+    run = read_run_recording(trained(*fixed).folder)
+    own = prepare(run)
+    logged = dataclasses.replace(run.recording, race={"OBJECT_POSITIONS": "0.3,1;0.6,-1"})
+    view = prepare(logged)
+    pd.testing.assert_frame_equal(view.others.table(), own.others.table())
+    assert own.others.table()["crashes"].sum() > 0
+    np.testing.assert_allclose(view.others.corners, own.others.corners)
+    np.testing.assert_allclose(view.others.lap_share, [0.3, 0.6])
+    for unknown in ({}, {"NUMBER_OF_OBSTACLES": "3"}, {"OBJECT_POSITIONS": "here"}):
+        assert prepare(dataclasses.replace(logged, race=unknown)).others is None
+
+
+def test_each_crash_of_a_recorded_training_is_one_with_its_bot(reference, tmp_path):
+    with tarfile.open(reference / "race_pace" / "console_v5_one_bot_ppo.tar.gz") as archive:
+        archive.extractall(tmp_path, filter="data")
+    params = {"NUMBER_OF_BOT_CARS": "1", "BOT_CAR_SPEED": "0.5", "IS_LANE_CHANGE": "False"}
+    (tmp_path / "training_params.yaml").write_text(
+        "".join(f'{key}: "{value}"\n' for key, value in params.items())
+    )
+    view = prepare(read_recording(tmp_path))
+    assert len(view.others.crashes) == (view.episodes["status"] == "crashed").sum() == 15
+    assert view.others.names == ("bot 1",)

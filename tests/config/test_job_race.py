@@ -5,7 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from deepracer_exp.aws.models.job_settings import race_values
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.job_race import recorded_race
 from tests.conftest import refused
 
 from .conftest import METADATA, REWARD
@@ -107,3 +109,15 @@ def test_a_value_that_the_service_would_not_accept_is_refused_in_one_line(job, k
     line = refused(composed, job("run.env", {"DR_RACE_TYPE": "OBJECT_AVOIDANCE", key: value}))
     assert f"{key}={value}" in line
     assert accepted in line
+
+
+def test_what_a_recording_s_parameters_leave_open_is_not_known():
+    lists = {"OBJECT_POSITIONS": ["0.1,-1", "0.25,1"], "NUMBER_OF_BOT_CARS": ["1"], "BOT_CAR_SPEED": 0.5}
+    race = recorded_race(race_values(lists))
+    assert [(box.lap, box.lane) for box in race.boxes.positions] == [(0.1, "outer"), (0.25, "inner")]
+    assert (race.bots.number, race.bots.speed_mps) == (1, 0.5)
+    moved = recorded_race(race_values(lists | {"IS_LANE_CHANGE": True}))
+    assert (moved.boxes.count, moved.bots.count) == (2, 0)
+    # The distance between boxes that are spread depends on the version of the service.
+    assert recorded_race({"NUMBER_OF_OBSTACLES": "4"}) is None
+    assert recorded_race({}) is None

@@ -10,6 +10,7 @@ from typing import IO, Any
 
 from deepracer_exp.aws.archives import READ_ERRORS, natural, reason_of
 from deepracer_exp.aws.models.hyperparameters import read_hyperparameters
+from deepracer_exp.aws.models.job_settings import race_values
 from deepracer_exp.aws.models.model_metadata import ModelMetadata, read_model_metadata
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import SETTINGS_BYTES, read_yaml
@@ -58,6 +59,8 @@ class Parts:
     metadata: list[tuple[LogFile, ModelMetadata]] = field(default_factory=list)
     hyperparameters: list[tuple[LogFile, dict[str, Any]]] = field(default_factory=list)
     reward: list[tuple[LogFile, str]] = field(default_factory=list)
+    races: dict[str, dict[str, str]] = field(default_factory=dict)
+    """By kind of job, what its parameters say of boxes and bots (`job_settings.race_values`)."""
     worlds: dict[str, str] = field(default_factory=dict)
     """Course by kind of job, from the files that start it."""
     files: list[LogFile] = field(default_factory=list)
@@ -150,8 +153,11 @@ def _read(parts: Parts, file: LogFile, alone: bool) -> bool:
         return True
     params = _PARAMS.fullmatch(name)
     if params is not None:
-        if world := _world(file, file.head(SETTINGS_BYTES + 1)):
+        job = read_yaml(file.path, "a job's parameters", raw=file.head(SETTINGS_BYTES + 1))
+        if world := _world(job):
             parts.worlds[params[1]] = world
+        if isinstance(job, Mapping):
+            parts.races[params[1]] = race_values(job)
         return True
     return _read_log(parts, file) if alone or LOG.search(name) else False
 
@@ -207,9 +213,8 @@ def _read_hyperparameters(parts: Parts, file: LogFile, raw: bytes) -> None:
     parts.refuse(file, [(None, f"hyperparameters: {reason}") for reason in refused])
 
 
-def _world(file: LogFile, raw: bytes) -> str:
+def _world(data: object) -> str:
     """Return the course named by a job's parameters, the first of several."""
-    data = read_yaml(file.path, "a job's parameters", raw=raw)
     world = data.get("WORLD_NAME") if isinstance(data, Mapping) else None
     world = world[0] if isinstance(world, list) and world else world
     return world if isinstance(world, str) else ""

@@ -126,6 +126,7 @@ class _Assembly:
             files=tuple(file.path for file in parts.files),
             checkpoints=dict(sorted((counted | named).items())),
             rounds=tuple(rounds) if len(rounds) > 1 else (),
+            race=parts.races.get(TRAINING) or next(iter(parts.races.values()), {}),
         )
 
     def _training_rows(self) -> tuple[list[Rows], Numbers, dict[int, int]]:

@@ -138,3 +138,6 @@ class Recording:
     recorded, their number: `309_Step-8349`."""
     rounds: tuple[Round, ...] = ()
     """The trainings in the order of `steps`; empty where there is only one."""
+    race: Mapping[str, str] = field(default_factory=dict)
+    """What the parameters of the training, or else of a race, say of boxes and bots, by the service's keys
+    (`job_settings.race_values`)."""

@@ -148,6 +148,19 @@ def read_training_params(path: str) -> tuple[JobSettings, ...]:
     )
 
 
+def race_values(params: Mapping[object, object]) -> dict[str, str]:
+    """Return the values about boxes and bots of the first worker of a training_params.yaml, as they stand there."""
+    values = {}
+    for key in (*OA_KEYS, *H2B_KEYS):
+        value = params.get(key)
+        if isinstance(value, list):
+            many = key == "OBJECT_POSITIONS" and not any(isinstance(part, list) for part in value)
+            value = value if many else next(iter(value), None)
+        if value is not None:
+            values[key] = ";".join(map(str, value)) if isinstance(value, list) else str(value)
+    return values
+
+
 def _read_env(path: str) -> dict[str, str]:
     accepted = "lines KEY=VALUE and comments (#)"
     values = {}
