@@ -14,7 +14,7 @@ from deepracer_exp.config.race import RaceConfig
 from deepracer_exp.env.real_car import require_car
 from deepracer_exp.errors import BadInput
 from deepracer_exp.lookup.resolve import StoredRun, resolve
-from deepracer_exp.lookup.rival import find_rival
+from deepracer_exp.lookup.rival import find_rival, kept_rival
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def plan_evaluation(run: str, overrides: Sequence[str], *, has_checkpoint: bool 
         import_own_classes(stored.experiment, OF_POLICY)
     if config.evaluation.real_car is not None:
         require_car(stored.experiment)
-    rival = _rival(stored.experiment, config)
+    rival = _rival(stored, config)
     is_named = any(group_of(override) == "evaluation" for override in overrides)
     protocol = config.evaluation if is_named else stored.experiment.evaluation
     return EvaluatePlan(stored, config, protocol, rival)
@@ -65,15 +65,14 @@ def race_of(experiment: Experiment, config: EvaluationConfig) -> RaceConfig:
         raise BadInput("evaluation.race", error) from None
 
 
-def _rival(experiment: Experiment, config: EvaluateConfig) -> StoredRun | None:
+def _rival(stored: StoredRun, config: EvaluateConfig) -> StoredRun | None:
+    experiment, run = stored.experiment, config.rival
     rivals = race_of(experiment, config.evaluation).rivals
-    key, run, checkpoint = "rival", config.rival, config.rival_checkpoint
     if rivals is None:
         if run is not None:
             raise BadInput(f"rival={run}", "this race has none", "evaluation=head_to_head")
         return None
-    if run is None and not rivals.is_own:
-        key, run, checkpoint = "race.rivals.policy", rivals.policy, rivals.checkpoint
-    if run is None:
-        return None
-    return find_rival(key, run, checkpoint, experiment, Path(config.runs_dir), config.tracking.uri)
+    if run is not None:
+        runs_dir, uri = Path(config.runs_dir), config.tracking.uri
+        return find_rival("rival", run, config.rival_checkpoint, experiment, runs_dir, uri)
+    return None if config.evaluation.race is not None else kept_rival(experiment, stored.path)

@@ -5,7 +5,9 @@ from pathlib import Path
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.action_space import build_action_space, describe_actions
 from deepracer_exp.errors import BadInput
+from deepracer_exp.runs.files import RIVAL
 
+from .kept import kept_run
 from .resolve import StoredRun, resolve
 
 
@@ -43,3 +45,15 @@ def find_rival(
     if theirs != ours:
         raise BadInput(what, f"has other actions: {theirs}", f"a run with {ours}")
     return stored
+
+
+def kept_rival(experiment: Experiment, run_dir: Path) -> StoredRun | None:
+    """Return the other run whose policy is kept in a run's folder as its rival; None: it has none.
+
+    Raises:
+        BadInput: as for `kept_run`.
+    """
+    config = experiment.race.rivals
+    if config is None or config.is_own:
+        return None
+    return kept_run(run_dir / RIVAL)

@@ -2,28 +2,17 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import torch
 
-from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.race import NEWEST, RivalsConfig
 from deepracer_exp.env.head_to_head import Rivals, Weights, rival_setup, weights_of
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.lookup.resolve import StoredRun
-from deepracer_exp.runs.files import RIVAL
-
-from .kept_policy import read_kept_policy
 
 _STATE = "rivals"
 """Key of the snapshots in a checkpoint."""
-
-
-def kept_rival(experiment: Experiment, run_dir: Path) -> StoredRun | None:
-    """Return the other run whose policy is kept in a run's folder as its rival; None: it has none."""
-    config = experiment.race.rivals
-    return None if config is None or config.is_own else StoredRun(run_dir / RIVAL)
 
 
 class RivalPool:
@@ -42,7 +31,7 @@ class RivalPool:
             config: the group's `rivals`.
             setup: of the learner's race.
             policy: the learner's; `take` keeps its weights.
-            kept: the other run, of `kept_rival`.
+            kept: the other run, with its checkpoint; None: the rivals are snapshots.
 
         Raises:
             BadInput: the other run's policy is missing or corrupt.
@@ -51,7 +40,7 @@ class RivalPool:
         self.weights: dict[int, Weights] = {}
         sees = setup.observation
         if kept is not None:
-            policy, sees = read_kept_policy(kept.path).networks.policy, kept.experiment.observation
+            policy, sees = kept.read_policy().networks.policy, kept.experiment.observation
             self.weights[0] = weights_of(policy)
         self._rivals = Rivals(setup=rival_setup(setup, sees), policy=policy, weights=())
 

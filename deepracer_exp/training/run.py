@@ -25,7 +25,9 @@ from deepracer_exp.config.learning import PPOConfig, SACConfig
 from deepracer_exp.config.own_class import own_classes
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.errors import NO_MEMORY, BadInput, RunFailed, count, is_refused_memory, reading
+from deepracer_exp.lookup.kept import keep_policy
 from deepracer_exp.lookup.resolve import StoredRun
+from deepracer_exp.lookup.rival import kept_rival
 from deepracer_exp.rewards.reward import RewardFunction
 from deepracer_exp.runs.checkpoints import check, checkpoint_name, intact_checkpoint, read_training
 from deepracer_exp.runs.files import (
@@ -55,11 +57,9 @@ from .budget import refuse_spent
 from .callback import Callback, TakenOver, TrainResult
 from .callbacks import standard_callbacks
 from .clone import describe_clone, read_parent
-from .kept_policy import keep_policy
 from .machine import memory_needed
 from .metrics import track_names
 from .plan import ResumePlan, TrainPlan
-from .rivals import kept_rival
 from .signals import Interruption
 from .teacher import check_teacher
 from .trainer import Trainer

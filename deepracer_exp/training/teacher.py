@@ -8,10 +8,9 @@ from tensordict.nn import TensorDictModuleBase
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.action_space import build_action_space, describe_actions
 from deepracer_exp.errors import BadInput
+from deepracer_exp.lookup.kept import kept_run
 from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.files import TEACHER
-
-from .kept_policy import read_kept_policy
 
 
 def check_teacher(run: StoredRun, experiment: Experiment) -> StoredRun:
@@ -47,4 +46,4 @@ def read_teacher(folder: Path) -> TensorDictModuleBase:
     Raises:
         BadInput: it is missing or corrupt.
     """
-    return read_kept_policy(folder / TEACHER).networks.policy
+    return kept_run(folder / TEACHER).read_policy().networks.policy

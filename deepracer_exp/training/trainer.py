@@ -28,6 +28,7 @@ from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.env.trace import PACKED, to_table
 from deepracer_exp.errors import RunFailed, reading
 from deepracer_exp.evaluation.result import Evaluation
+from deepracer_exp.lookup.rival import kept_rival
 from deepracer_exp.runs.checkpoints import CheckpointStore, read_agent
 from deepracer_exp.runs.crash_dump import write_crash_dump
 from deepracer_exp.runs.files import SUMMARY, TRACE
@@ -41,7 +42,7 @@ from .best import BestPolicy
 from .budget import Budget
 from .callback import Callback, TrainResult
 from .metrics import NOT_EVALUATED, Finished, RunMetrics, track_names
-from .rivals import RivalPool, kept_rival
+from .rivals import RivalPool
 from .signals import Interruption
 from .teacher import read_teacher
 

@@ -56,6 +56,9 @@ def test_against_another_run_a_resumed_training_needs_only_its_own_folder(traine
     ended = call("resume", run.name, "budget.iterations=6")
     assert ended.code == 0, ended.stderr
     assert_same_run(run, whole)
+    raced = call("evaluate", run.name, "evaluation.trials=2", "evaluation.time_s=2")
+    assert raced.code == 0, raced.stderr
+    assert "against rival, checkpoint" in raced.stderr.replace("\n", " ")
 
 
 def test_a_clone_begins_its_pool_with_its_parent_s_policy(copied, call, tmp_path):

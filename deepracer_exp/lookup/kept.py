@@ -1,12 +1,12 @@
-"""A policy of another run that a run keeps in its own folder, so that it can be resumed wherever it is moved to."""
+"""Another run's policy in a run's own folder, so that the run can be resumed wherever it is moved to."""
 
 import shutil
 from pathlib import Path
 
 from deepracer_exp.errors import BadInput
-from deepracer_exp.lookup.resolve import StoredRun
-from deepracer_exp.runs.checkpoints import StoredPolicy, check, read_policy
 from deepracer_exp.runs.files import CHECKPOINTS, CONFIG
+
+from .resolve import StoredRun
 
 
 def keep_policy(run: StoredRun, target: Path) -> None:
@@ -20,11 +20,11 @@ def keep_policy(run: StoredRun, target: Path) -> None:
     shutil.copy(run.path / CONFIG, target / CONFIG)
 
 
-def read_kept_policy(folder: Path) -> StoredPolicy:
-    """Return the policy that is kept in a folder.
+def kept_run(folder: Path) -> StoredRun:
+    """Return the run with the checkpoint that `keep_policy` has copied into a folder.
 
     Raises:
-        BadInput: it is missing or corrupt.
+        BadInput: it is missing, or as for `StoredRun.with_policy`.
     """
     kept = StoredRun(folder)
     try:
@@ -33,4 +33,4 @@ def read_kept_policy(folder: Path) -> StoredPolicy:
         raise BadInput(
             kept.checkpoints, f"is not one checkpoint, which a run with a {folder.name} has there"
         ) from error
-    return read_policy(kept.experiment, check(checkpoint))
+    return kept.with_policy(checkpoint.name)
