@@ -326,3 +326,65 @@ def test_a_nearer_box_hides_a_farther_one_even_if_its_middle_is_farther():
 def test_a_box_behind_the_camera_or_of_no_height_changes_nothing():
     assert np.array_equal(boxed(box(-0.5, 0, 0.3, 0.4, 0.4, 0.4, 255)), boxed())
     assert np.array_equal(boxed(box(1, 0, 0.3, 0.4, 0.4, 0, 255)), boxed())
+
+
+def painted_range(boxes: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the grey picture without boxes, and the brightest and darkest that a face of one can be."""
+    faces = np.outer(boxes[:, 6], FACE_LIGHT)
+    alone = boxed()
+    return np.minimum(alone, faces.min()), max(alone.max(), faces.max())
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_boxes_in_each_other_and_around_the_camera_only_mix_colours_that_are_there(seed):
+    generator = np.random.default_rng(seed)
+    # Some around the eye, some beside and behind it, most of them overlapping.
+    low, high = [-0.4, -0.4, -3, 0.05, 0.05, 0.02, 0], [1.2, 0.4, 3, 1.0, 0.8, 0.5, 255]
+    boxes = np.array([box(*generator.uniform(low, high)) for _ in range(12)])
+    darkest, brightest = painted_range(boxes)
+    ours = boxed(*boxes)
+    # Shares below 0 or above 1 of any colour would leave this range; each of 12 boxes may round once.
+    assert (ours >= darkest - 6).all()
+    assert (ours <= brightest + 6).all()
+    covered, _ = met_boxes(boxes, 8)
+    # Where no ray meets a box nothing is painted, but for corners between rays; where all do, nothing of the road is
+    # seen, but for outlines of two boxes that share a pixel.
+    assert np.abs(ours - boxed())[covered == 0].max(initial=0) < 255 / 64 + 2
+    light = boxes.copy()
+    light[:, 6] = 255
+    faces = np.outer(light[:, 6], FACE_LIGHT)
+    assert (boxed(*light)[covered == 1] >= faces.min() - 6).mean() > 0.99
+
+
+def test_of_boxes_in_each_other_the_one_with_the_nearer_middle_is_whole():
+    near, far = box(0.8, 0.05, 0.2, 0.4, 0.3, 0.25, 200), box(0.95, -0.05, -0.4, 0.4, 0.3, 0.4, 20)
+    covered, _ = met_boxes(np.array([near]), 8)
+    whole = covered == 1
+    assert whole.sum() > 50
+    for both in (boxed(near, far), boxed(far, near)):
+        assert np.abs(both - boxed(near))[whole].max() <= 255 / 64
+        assert not np.array_equal(both, boxed(near))
+
+
+def test_a_camera_inside_a_box_sees_out_of_it():
+    eye = LENS.x_m, LENS.y_m
+    around = box(*eye, 0.3, 0.4, 0.3, 0.25, 200)
+    assert np.array_equal(boxed(around), boxed())
+    ahead = box(1.0, 0.1, 0.2, 0.4, 0.3, 0.25, 20)
+    assert np.array_equal(boxed(around, ahead), boxed(ahead))
+
+
+def test_a_box_that_ends_below_the_camera_covers_the_bottom_of_the_picture():
+    under = box(0.4, 0, 0.1, 1.2, 1.0, 0.06, 200)
+    covered, grey = met_boxes(np.array([under]), 16)
+    ours = boxed(under)
+    assert (covered[-1] == 1).all()
+    assert np.abs(ours - boxed() * (1 - covered) - grey).mean() < 0.4
+    assert (np.abs(ours[-1] - 200 * FACE_LIGHT[0]) <= 1).all()
+
+
+def test_a_box_that_begins_behind_the_camera_covers_what_rays_meet():
+    beside = box(0.2, 0.35, 0.05, 1.6, 0.3, 0.4, 200)
+    covered, grey = met_boxes(np.array([beside]), 16)
+    assert 0.05 < covered.mean() < 0.6
+    assert np.abs(boxed(beside) - boxed() * (1 - covered) - grey).mean() < 0.4
