@@ -202,6 +202,9 @@ Height = Annotated[float, Field(ge=-0.1, le=0.5, allow_inf_nan=False)]
 # From -1/3 on, the picture's corners would show what lies nearer to its middle once more.
 Distortion = Annotated[float, Field(ge=-0.3, le=0.3, allow_inf_nan=False)]
 
+# Beyond, a policy would learn other clearances than the crash rule has.
+OthersScale = Annotated[float, Field(ge=0.7, le=1.4, allow_inf_nan=False)]
+
 
 @dataclass(frozen=True, kw_only=True)
 class PictureRandomizationConfig:
@@ -220,6 +223,7 @@ class PictureRandomizationConfig:
     dirt: Range[Fraction] = (0.0, 0.0)
     objects: Range[Objects] = (0, 0)
     lens_k1: Range[Distortion] = (0.0, 0.0)
+    others_scale: Range[OthersScale] = (1.0, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)

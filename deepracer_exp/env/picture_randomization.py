@@ -16,11 +16,12 @@ from .randomization import CarStreams, Ids, Purpose
 
 QUANTITIES = tuple(field.name for field in fields(PictureRandomizationConfig))
 _COLUMN = {name: column for column, name in enumerate(QUANTITIES)}
-_LENS = _COLUMN["lens_k1"]
+_LENS, _OTHERS = _COLUMN["lens_k1"], _COLUMN["others_scale"]
 _OFF = np.array([1.0 if name.endswith("_scale") else 0.0 for name in QUANTITIES])
 _FIRST_QUANTITIES, _FIRST_MATERIALS = 10, 8
 """Quantities and materials added later are drawn after everything else, so that they change no earlier draw. The lens
-was added after the objects, which draw a varying number of values, and so has streams of its own."""
+and the looks of others were added after the objects, which draw a varying number of values, and so have streams of
+their own."""
 _FACTOR_OF = [MATERIALS.index(name.removeprefix("far_")) for name in MATERIALS]
 """Whose colour factor a material has: farther ahead a line keeps its colour."""
 _MIDDLE = 127.5
@@ -55,8 +56,12 @@ class PictureRandomization:
         configs: Sequence[PictureRandomizationConfig | None],
         cars: Sequence[int],
         tracks: Sequence[Track],
+        others: int = 0,
     ) -> None:
-        """Take each car's ranges and its number over all processes; call `seed` and then `begin` next."""
+        """Take each car's ranges, its number over all processes and how many others there are around it.
+
+        Call `seed` and then `begin` next.
+        """
         none = np.stack([_OFF, _OFF], axis=1)
         ranges = np.array(
             [
@@ -80,12 +85,15 @@ class PictureRandomization:
         self._span[:, _COLUMN["objects"]] += 1  # 0, 1 and 2 objects are equally probable
         self._places = [_places(track) for track in tracks] if most else []
         self._boxes = np.zeros((n_cars, most, 9), np.float32)
+        # Factors on the size and on red, green and blue.
+        self._looks = np.ones((n_cars, others, 4))
         self._noise = np.random.default_rng(0).standard_normal(_NOISE_NUMBERS).astype(np.float32)
 
     def seed(self, seed: int) -> None:
         """Start all streams from `seed`."""
         self._streams = CarStreams(seed, self._cars, Purpose.PICTURE)
         self._lens_streams = CarStreams(seed, self._cars, Purpose.LENS)
+        self._look_streams = CarStreams(seed, self._cars, Purpose.LOOKS)
 
     def begin(self, ids: Ids, episodes: NDArray[np.int64], course: NDArray[np.intp]) -> None:
         """Draw for new episodes of the cars `ids` on tracks `course`; episodes are numbered per car from 0."""
@@ -100,9 +108,11 @@ class PictureRandomization:
             stream.random(out=draws[_FIRST_QUANTITIES:_LENS])
             stream.standard_normal(out=normal[_FIRST_MATERIALS:])
             draws[_LENS] = self._lens_streams.stream(car, episode).random()
+            draws[_OTHERS] = 0.0  # each other has one of its own
             values = self._low[car] + self._span[car] * draws
             self._values[car] = values
             self._color_factor[car] = 1.0 + values[_COLUMN["color_noise"]] * normal[_FACTOR_OF]
+            self._draw_looks(car, episode, values[_COLUMN["color_noise"]])
             depth = values[_COLUMN["light"]] * (1.0 if sign < 0.5 else -1.0)
             self._spot[car] = depth, x, y, _SPOT_SIZE[0] + (_SPOT_SIZE[1] - _SPOT_SIZE[0]) * size
             self._dirt[car] = stream.random((_DIRT_SPOTS, 3))
@@ -110,6 +120,14 @@ class PictureRandomization:
             if len(self._boxes[car]):
                 objects = stream.random((int(values[_COLUMN["objects"]]), 8))
                 self._place_objects(car, objects, self._places[track])
+
+    def _draw_looks(self, car: int, episode: int, color_noise: float) -> None:
+        """Draw the factors on size and colours of the boxes and bots around a car."""
+        looks = self._looks[car]
+        if len(looks):
+            stream = self._look_streams.stream(car, episode)
+            looks[:, 0] = self._low[car, _OTHERS] + self._span[car, _OTHERS] * stream.random(len(looks))
+            looks[:, 1:] = 1.0 + color_noise * stream.standard_normal((len(looks), 3))
 
     def _place_objects(self, car: int, objects: Floats, places: Floats) -> None:
         """Set the car's boxes from uniform draws (n, 8); those that would overlap others are left out."""
@@ -151,6 +169,13 @@ class PictureRandomization:
     def boxes(self, ids: Ids) -> NDArray[np.float32] | None:
         """Return the boxes beside the road, in red, green and blue, (n, most, 9); see `camera.take_pictures`."""
         return self._boxes[ids] if self._boxes.size else None
+
+    def others(self, ids: Ids, others: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return boxes and bots on the road as they look in the episodes, (n, K, 9); see `camera.take_pictures`."""
+        looks = self._looks[ids]
+        colors = self.exposed(ids, np.clip(others[..., 6:] * looks[..., 1:], 0, 255))
+        sizes = others[..., 3:6] * looks[..., :1]
+        return np.concatenate([others[..., :3], sizes.astype(np.float32), colors], axis=-1)
 
     def disturb(self, ids: Ids, pictures: NDArray[np.uint8], steps: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Add the lens's distortion, dirt, light, blur and noise to pictures (n, channels, height, width).

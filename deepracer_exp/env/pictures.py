@@ -130,7 +130,7 @@ class Pictures:
         if varied is not None:
             colors, boxes = varied.colors(ids, colors), varied.boxes(ids)
             if others is not None:
-                others = np.concatenate([others[..., :6], varied.exposed(ids, others[..., 6:])], axis=-1)
+                others = varied.others(ids, others)
                 boxes = others if boxes is None else np.concatenate([boxes, others], axis=1)
         if self._grey:
             colors = (colors @ GREY)[..., None]

@@ -119,9 +119,10 @@ class Race:
         real_car = setup.real_car
         pictures = [randomization.pictures for randomization in randomizations]
         lidar = setup.observation.lidar
+        others = 0 if setup.others is None else setup.others.others
         seen = camera is not None or lidar is not None
         self._varied = (
-            PictureRandomization(pictures, self.cars.tolist(), tracks)
+            PictureRandomization(pictures, self.cars.tolist(), tracks, others)
             if seen and any(config is not None for config in pictures)
             else None
         )
@@ -134,7 +135,6 @@ class Race:
         )
         self.pixels = np.zeros((n_cars, *(camera.shape if camera is not None else (0,))), np.uint8)
         boxes = 0 if self._varied is None else self._varied.most_boxes
-        others = 0 if setup.others is None else setup.others.others
         self._lidar = (
             None if lidar is None else Lidar(lidar, tracks, self.cars.tolist(), self._period_s, boxes, others)
         )

@@ -39,6 +39,7 @@ class Purpose(IntEnum):
     POLICY = 6
     OTHERS = 7
     RIVALS = 8
+    LOOKS = 9
 
 
 class CarStreams:

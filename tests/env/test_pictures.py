@@ -210,9 +210,37 @@ def test_a_lens_changes_no_other_draw(race_of):
     plain, bent = (
         race_of(*VARIED, f"randomization.pictures.lens_k1=[{k1},{k1}]", n_cars=4) for k1 in (0, 0.1)
     )
-    assert np.array_equal(plain._varied._values[:, :-1], bent._varied._values[:, :-1])
+    place = QUANTITIES.index("lens_k1")
+    assert np.array_equal(*(np.delete(race._varied._values, place, axis=1) for race in (plain, bent)))
     for name in ("_boxes", "_dirt", "_spot", "_color_factor", "_noise_start"):
         assert np.array_equal(getattr(plain._varied, name), getattr(bent._varied, name))
+
+
+def test_boxes_and_bots_look_different_in_every_episode_and_stand_where_they_stand(race_of):
+    among = ("race=head_to_bot", "race.boxes.number=2", "track=reInvent2019_track")
+    race = race_of(*VARIED, *among, n_cars=3)
+    ids = np.arange(3)
+    looks = []
+    for _ in range(2):
+        plain = race.others.boxes(ids)
+        varied = race._varied.others(ids, plain)
+        np.testing.assert_array_equal(varied[..., :3], plain[..., :3])
+        scale = varied[..., 3:6] / plain[..., 3:6]
+        np.testing.assert_allclose(scale, np.broadcast_to(scale[..., :1], scale.shape), rtol=1e-5)
+        assert scale.min() >= 0.85 - 1e-5
+        assert scale.max() <= 1.15 + 1e-5
+        looks.append(varied[..., 3:])
+        race.reset()
+    both = np.concatenate(looks)
+    assert len(np.unique(both[..., 0])) == both[..., 0].size
+    assert (np.ptp(both[..., 3:], axis=0) > 0).any()
+
+
+def test_the_looks_of_others_change_no_other_draw(race_of):
+    alone = race_of(*VARIED, "track=reInvent2019_track", n_cars=4)
+    among = race_of(*VARIED, "track=reInvent2019_track", "race=head_to_bot", n_cars=4)
+    for name in ("_values", "_boxes", "_dirt", "_spot", "_color_factor", "_noise_start"):
+        assert np.array_equal(getattr(alone._varied, name), getattr(among._varied, name))
 
 
 @pytest.mark.parametrize("track", ["reinvent_base", "Spain_track", "2022_summit_speedway_cw"])

@@ -9,7 +9,7 @@ import shapely
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from deepracer_exp.sim.camera import FACE_LIGHT, Lens, take_pictures
+from deepracer_exp.sim.camera import FACE_LIGHT, NEAREST_M, Lens, take_pictures
 from deepracer_exp.sim.scenery import (
     CURVES_UNTIL_M,
     DASH_WIDTH_M,
@@ -21,6 +21,7 @@ from deepracer_exp.sim.scenery import (
     START_LENGTH_M,
     START_WIDTH_M,
     Scenery,
+    box_corners,
     build_scenery,
     join_sceneries,
     paved_area,
@@ -341,6 +342,10 @@ def test_boxes_in_each_other_and_around_the_camera_only_mix_colours_that_are_the
     # Some around the eye, some beside and behind it, most of them overlapping.
     low, high = [-0.4, -0.4, -3, 0.05, 0.05, 0.02, 0], [1.2, 0.4, 3, 1.0, 0.8, 0.5, 255]
     boxes = np.array([box(*generator.uniform(low, high)) for _ in range(12)])
+    # Of a face less than NEAREST_M before the eye nothing is seen.
+    outlines = shapely.polygons(box_corners(boxes))
+    away_m = shapely.distance(outlines, shapely.Point(rays(LENS, EYE[0], 1)[0][:2]))
+    boxes = boxes[(away_m == 0) | (away_m > 2 * NEAREST_M)]
     darkest, brightest = painted_range(boxes)
     ours = boxed(*boxes)
     # Shares below 0 or above 1 of any colour would leave this range; each of 12 boxes may round once.
