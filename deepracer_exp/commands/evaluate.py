@@ -49,6 +49,9 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     add_run(parser, "checkpoint=NAME | evaluation=NAME | KEY=VALUE")
     parser.add_argument("--video", metavar="FILE", help="film the fastest usual lap (.mp4)")
     parser.add_argument(
+        "--trace", metavar="FOLDER", help="write every control step as the service does (for `analyze`)"
+    )
+    parser.add_argument(
         "--cfg", action="store_true", help="print the composed configuration as YAML and stop"
     )
 
@@ -119,7 +122,9 @@ def _evaluate(args: argparse.Namespace) -> int:
     run, overrides = run_and_overrides(args)
     check_file("--video", args.video, ".mp4")
     plan = _planned(args, run, overrides)
-    video = None if args.video is None else Path(args.video)
+    video, trace = (None if path is None else Path(path) for path in (args.video, args.trace))
+    if trace is not None and (trace.is_file() or (trace.is_dir() and any(trace.iterdir()))):
+        raise BadInput(f"--trace {trace}", "is there already and not empty", "a new or an empty folder")
     if video is not None:
         choose_graphics()
 
@@ -129,7 +134,7 @@ def _evaluate(args: argparse.Namespace) -> int:
 
     out = Console(width=None if sys.stdout.isatty() else 160)
     with warnings_on_stderr():
-        evaluate_run(plan, video, out, Console(stderr=True))
+        evaluate_run(plan, video, out, Console(stderr=True), trace)
     return 0
 
 

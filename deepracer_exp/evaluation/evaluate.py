@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from rich.console import Console
 from rich.table import Table
+from tensordict import TensorDict
 
 from deepracer_exp.aws.models.car_controls import full_scale, throttle
 from deepracer_exp.config.evaluation import EvaluationConfig, RealCarConfig
@@ -17,6 +18,7 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.running import MLflowTracking
 from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.env.head_to_head import HeadToHead
+from deepracer_exp.env.race import Race
 from deepracer_exp.errors import RunFailed, count, writing
 from deepracer_exp.files import atomic_write
 from deepracer_exp.runs.checkpoints import StoredPolicy
@@ -28,7 +30,9 @@ from deepracer_exp.tracks.boards import Standing, standings, what_it_sees
 from .evaluator import Evaluator, tracks_of
 from .film import LapRecorder, best_attempt
 from .plan import EvaluatePlan
+from .race_protocol import RaceProtocol
 from .result import CONFIDENCE, NOTHING, USUAL, Evaluation, number, zigzag_columns
+from .trace import TraceRecorder
 
 _TIMES = ("lap s", "median", "best", "std", "score s")
 _MINOR = ("median", "std", "score s", "zig-zag /m")
@@ -160,8 +164,17 @@ def _mean(statistics: Mapping[str, Any], digits: int, intervals: bool, factor: f
     return mean if low == high else f"{mean} ({low}\N{EN DASH}{high})"
 
 
-def evaluate_run(plan: EvaluatePlan, video: Path | None, out: Console, err: Console) -> Evaluation:
+def evaluate_run(
+    plan: EvaluatePlan, video: Path | None, out: Console, err: Console, trace: Path | None = None
+) -> Evaluation:
     """Race a run's checkpoint under a protocol, print the table, write the JSON file, record both in MLflow.
+
+    Args:
+        plan: of the evaluation.
+        video: file for the film of a lap; None: no film.
+        out: where results are printed.
+        err: where progress is printed.
+        trace: folder for the control steps; None: they are not written.
 
     Raises:
         BadInput: the checkpoint, a track or a condition cannot be used, or the machine cannot render.
@@ -175,6 +188,13 @@ def evaluate_run(plan: EvaluatePlan, video: Path | None, out: Console, err: Cons
         run.experiment, config, rival_sees=plan.rival.experiment.observation if plan.rival else None
     )
     recorder = LapRecorder(evaluator)
+    traced = TraceRecorder(config)
+    recorders = [recorder] * (video is not None) + [traced] * (trace is not None)
+
+    def record(race: Race, protocol: RaceProtocol, acted: TensorDict) -> None:
+        for on_step in recorders:
+            on_step(race, protocol, acted)
+
     err.print(
         f"{run.path.name}, checkpoint {stored.path.name}: {count(len(evaluator.trials), 'trial')}"
         + _against(plan, rival, evaluator),
@@ -182,7 +202,7 @@ def evaluate_run(plan: EvaluatePlan, video: Path | None, out: Console, err: Cons
     )
     evaluation = evaluator(
         stored.networks.policy,
-        recorder if video is not None else None,
+        record if recorders else None,
         None if rival is None else rival.networks.policy,
     )
     car = None
@@ -206,6 +226,9 @@ def evaluate_run(plan: EvaluatePlan, video: Path | None, out: Console, err: Cons
         f"\n  zig-zag  {evaluation.on(USUAL).zigzag.words()}, on straights", soft_wrap=True, highlight=False
     )
     out.print(f"  results  {file}", soft_wrap=True, highlight=False)
+    if trace is not None:
+        for written in traced.write(trace, evaluator.race):
+            out.print(f"  trace    {written}", soft_wrap=True, highlight=False)
     files = {file: EVALUATIONS}
     if video is not None:
         from .video import write_video  # imports MuJoCo's renderer

@@ -29,7 +29,7 @@ _HYPERPARAMETERS = re.compile(r"hyper_?parameters.*?(?:\.json)?")
 _PARAMS = re.compile(r"(training|evaluation)_params.*\.ya?ml")
 # Files that lie beside the logs of a model and hold no data of a recording.
 _BESIDE = re.compile(
-    r".*\.(?:pb|ckpt.*|meta|index|data-.*|mp4|png|jpg|py|ya?ml|lock|ready|done|finished|pbtxt)|\..*|done|checkpoint"
+    r".*\.(?:pb|ckpt.*|meta|index|data-.*|mp4|png|jpg|py|parquet|ya?ml|lock|ready|done|finished|pbtxt)|\..*|done|checkpoint"
     r"|worker_\d+\..*\.csv|ip\.json|deepracer_checkpoints\.json|.*[cC]heckpoint.*\.json|.*(?:model|carfile).*\.tar\.gz"
 )
 _MOST_NAMED = 3

@@ -161,6 +161,15 @@ def write_trace(numbered: NumberedTraining, folder: Path, log: Path, head: str) 
                 out.write(_episode_line(episode, driven, episode.reward) + "\n")
 
 
+def write_evaluation_trace(rows: pd.DataFrame, folder: Path) -> Path:
+    """Write the steps of an evaluation, with the columns of a trace, as the service does; return the file."""
+    file = folder / "evaluation-simtrace" / "0-iteration.csv"
+    file.parent.mkdir()
+    table = _trace(rows.assign(number=rows["episode"]))
+    table.assign(steps=table["steps"].astype(np.float64)).to_csv(file, index=False)
+    return file
+
+
 def _trace(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows with the columns of `TRACE_HEADER`."""
     table = rows.assign(episode=rows["number"])[TRACE_HEADER.split(",")]

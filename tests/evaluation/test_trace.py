@@ -1,0 +1,67 @@
+"""The trace of an evaluation: crashes and pauses as the service writes them, and where the others were."""
+
+import numpy as np
+import pyarrow.parquet as pq
+
+from deepracer_exp.aws.logs.reader import read_recording
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.env.placement import read_placements, rebuild_poses
+from deepracer_exp.env.trace import STATUS_CODE
+from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.evaluation.trace import OTHERS, TraceRecorder, pauses_left_s
+
+from .conftest import Driver
+
+
+def test_a_penalty_counts_down_from_the_row_in_which_it_is_given():
+    words = ["in_progress", "crashed", "pause", "pause", "in_progress", "off_track", "pause"]
+    status = np.array([STATUS_CODE[word] for word in words], np.float64)
+    # The end of the race cuts the penalty of the second trial off.
+    episode = np.array([0.0, 0, 0, 0, 0, 1, 1])
+    left_s = pauses_left_s(status, episode, {"crashed": 1.0, "off_track": 2.0}, 0.5)
+    assert left_s.tolist() == [0, 1.0, 0.5, 0, 0, 2.0, 1.5]
+
+
+def test_the_steps_of_an_evaluation_are_written_and_every_pose_of_the_others_is_rebuilt(protocol, tmp_path):
+    options = (
+        "race=head_to_bot",
+        "race.boxes.number=4",
+        "observation.next_objects=1",
+        "action_space=continuous",
+    )
+    experiment = compose_experiment(["track=reInvent2019_track", *options])[0]
+    config = protocol("object_avoidance", trials=2, time_s=20.0)
+    evaluator = Evaluator(experiment, config, threads=1)
+    recorder, poses = TraceRecorder(config), []
+
+    def record(race, running, acted):
+        recorder(race, running, acted)
+        poses.append(race.others.others.poses.copy())
+
+    evaluation = evaluator(Driver(experiment), record)
+    recorder.write(tmp_path / "trace", evaluator.race)
+    read = read_recording(tmp_path / "trace")
+    assert read.problems == ()
+    steps = read.steps.sort_values(["episode", "steps"], kind="stable")
+    assert steps["stream"].nunique() == 1
+    status = steps["episode_status"].astype(str).to_numpy()
+    crashes = sum(attempt.crashes for attempt in evaluation.groups[0].attempts)
+    assert (status == "crashed").sum() == crashes > 0
+    after = np.flatnonzero(status == "crashed")
+    assert (status[after + 1] == "pause").all()
+    left_s = steps["pause_duration"].to_numpy()
+    np.testing.assert_allclose(left_s[after], 5.0)
+    np.testing.assert_allclose(left_s[after + 1], 5.0 - experiment.car.control_period_s)
+    assert (steps["pause_duration"].to_numpy()[status == "in_progress"] == 0).all()
+    assert (steps["reward"] == 0).all()
+    placed = read_placements(pq.read_table(tmp_path / "trace" / OTHERS))[False]
+    episode, step = (steps[name].to_numpy(np.intp) for name in ("episode", "steps"))
+    rebuilt, _ = rebuild_poses(
+        experiment.race,
+        evaluator.race.setup.track,
+        [placed[number] for number in sorted(placed)],
+        experiment.car.control_period_s,
+        episode,
+        step.astype(np.int64),
+    )
+    np.testing.assert_array_equal(rebuilt, np.array(poses)[step - 1, episode])
