@@ -1,5 +1,6 @@
 """The policies that a run races against: snapshots of itself, or one of another run."""
 
+import copy
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -42,7 +43,8 @@ class RivalPool:
         if kept is not None:
             policy, sees = kept.read_policy().networks.policy, kept.experiment.observation
             self.weights[0] = weights_of(policy)
-        self._rivals = Rivals(setup=rival_setup(setup, sees), policy=policy, weights=())
+        # A copy: TorchRL takes the learner's weights away from its layers while it sends these to workers.
+        self._rivals = Rivals(setup=rival_setup(setup, sees), policy=copy.deepcopy(policy), weights=())
 
     @property
     def driving(self) -> tuple[Weights, ...]:

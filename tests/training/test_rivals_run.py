@@ -7,6 +7,7 @@ import pytest
 
 from deepracer_exp.runs.checkpoints import check, read_training
 from deepracer_exp.runs.files import read_metrics
+from tests.conftest import IN_WORKERS
 
 from .conftest import assert_same_run
 
@@ -43,6 +44,27 @@ def test_the_rival_decides_what_is_learned(trained):
     # Up to the first iteration with two snapshots, and from then on.
     assert losses[0][:1] == losses[1][:1]
     assert losses[0][2:] != losses[1][2:]
+
+
+def test_rivals_reach_the_workers_and_a_resumed_run_of_several_is_the_uninterrupted_one(call, tmp_path):
+    def trained_by_two(name: str, *overrides: str):
+        ended = call(
+            *("train", *IN_WORKERS, "report=false", f"name={name}", *RACE, *OFTEN),
+            *("race.rivals.snapshot_every=1", "race.rivals.policy=pool", *overrides),
+        )
+        assert ended.code == 0, ended.stderr
+        (config,) = (tmp_path / "runs" / name).glob("*/config.yaml")
+        return config.parent
+
+    whole, run = trained_by_two("whole", *THREE[:1], "budget.iterations=4"), trained_by_two("half", *THREE)
+    ended = call("resume", run.name, "budget.iterations=4")
+    assert ended.code == 0, ended.stderr
+    rows = [
+        [(row["policy_loss"], row["mean_return"]) for row in read_metrics(folder / "metrics.jsonl")]
+        for folder in (whole, run)
+    ]
+    assert rows[0] == rows[1]
+    assert snapshots(run) == [0, 1, 2, 3, 4]
 
 
 def test_against_another_run_a_resumed_training_needs_only_its_own_folder(trained, copied, call):
