@@ -26,8 +26,8 @@ def terms(params: dict) -> dict:
         gained = 0.0
     _last["progress"], _last["steps"] = params["progress"], params["steps"]
     blocked = 0.0
-    sides = params.get("objects_left_of_center")  # deepracer-on-aws validates without it
-    if sides:
+    sides = params["objects_left_of_center"]
+    if sides and "projection_distance" in params:  # deepracer-on-aws validates without it
         ahead = params["closest_objects"][1]
         if sides[ahead] == params["is_left_of_center"]:
             gap = (params["objects_distance"][ahead] - params["projection_distance"]) % params["track_length"]

@@ -33,8 +33,8 @@ def terms(params: dict) -> dict:
     _last["progress"], _last["steps"] = params["progress"], params["steps"]
     made = gained / 100.0 * params["track_length"]
     relative = 0.0
-    speeds = params.get("objects_speed")  # deepracer-on-aws validates without it
-    if speeds:
+    speeds = params["objects_speed"]
+    if speeds and "projection_distance" in params:  # deepracer-on-aws validates without it
         gaps = [
             around(params["objects_distance"][i] - params["projection_distance"], params["track_length"])
             for i in params["closest_objects"]

@@ -70,7 +70,8 @@ def test_a_runs_own_reward_is_paid_again_in_every_row(trained, overrides):
     source = named_reward_source(str(run / "reward_function.py"))
     car = parse_experiment(read_config(run)).car
     replayed = reward_replay.replay_reward(prepare(read_run_recording(run)), source, car)
-    np.testing.assert_allclose(replayed.steps["new_reward"], replayed.steps["reward"], rtol=0, atol=1e-9)
+    # Traces keep four decimals of progress: a step's gain is known to 1e-4% of the lap, 2e-5 m.
+    np.testing.assert_allclose(replayed.steps["new_reward"], replayed.steps["reward"], rtol=0, atol=2e-5)
     both = {False, True} if "track.direction=alternate" in overrides else {False}
     assert set(replayed.waypoints["reversed"]) == both
 
