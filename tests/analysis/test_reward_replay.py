@@ -12,11 +12,14 @@ from deepracer_exp.analysis.reward_replay import ReplayedRewards
 from deepracer_exp.aws.logs.recording import STEP_COLUMNS
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.parse import parse_experiment
+from deepracer_exp.env.trace import SCHEMA
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.source import named_reward_source
+from deepracer_exp.runs import trace
 from deepracer_exp.runs.files import read_config
 from deepracer_exp.runs.recording import read_run_recording
 from deepracer_exp.tracks.track import Track
+from tests.conftest import IN_PROCESS, call_in
 
 from .conftest import CONSOLE
 from .made_up import Drive, made_up_recording, typed
@@ -65,15 +68,23 @@ def test_the_services_own_reward_is_paid_again_in_all_44247_rows_and_in_the_eval
 @pytest.mark.parametrize(
     "overrides", [(), ("track=Bowtie_track", "track.direction=alternate"), ("reward=progress_delta",)]
 )
-def test_a_runs_own_reward_is_paid_again_in_every_row(trained, overrides):
-    run = trained(*overrides, "budget.iterations=2").folder
+def test_a_runs_own_reward_is_paid_again_in_every_row(tmp_path, monkeypatch, overrides):
+    # Without the rounding of traces, of which the test below tells how much it changes.
+    monkeypatch.setattr(trace, "_STORED", SCHEMA)
+    run = call_in(tmp_path, "train", *IN_PROCESS, *overrides, "budget.iterations=2").folder
     source = named_reward_source(str(run / "reward_function.py"))
     car = parse_experiment(read_config(run)).car
     replayed = reward_replay.replay_reward(prepare(read_run_recording(run)), source, car)
-    # Traces keep four decimals of progress: a step's gain is known to 1e-4% of the lap, 2e-5 m.
-    np.testing.assert_allclose(replayed.steps["new_reward"], replayed.steps["reward"], rtol=0, atol=2e-5)
+    np.testing.assert_allclose(replayed.steps["new_reward"], replayed.steps["reward"], rtol=0, atol=1e-9)
     both = {False, True} if "track.direction=alternate" in overrides else {False}
     assert set(replayed.waypoints["reversed"]) == both
+
+
+def test_the_decimals_of_a_trace_are_enough_to_pay_a_reward_again(trained):
+    run = trained("reward=progress_delta", "budget.iterations=2").folder
+    replayed = replay_reward(prepare(read_run_recording(run)), "progress_delta")
+    # A step's gain is known to 1e-6% of a lap of 17.7 m, the recorded reward to seven digits.
+    np.testing.assert_allclose(replayed.steps["new_reward"], replayed.steps["reward"], rtol=1e-6, atol=4e-7)
 
 
 def test_step_by_step_and_all_at_once_pay_the_same(own, reward):
