@@ -35,7 +35,7 @@ from .report import benchmark_parser, number, table, with_exit_code, write_json
 
 WANTED = 0.7
 TIME_S = 60.0
-"""Duration of a race that nobody finishes: a policy that has learned nothing finishes none."""
+"""Duration of a race in which neither car finishes; a policy that has learned nothing finishes none."""
 _KEPT = ("experiment=head_to_head", "checkpoints.keep=1000", "report=false", "tracking=off")
 
 

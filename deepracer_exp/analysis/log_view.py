@@ -73,7 +73,7 @@ class LogView:
     discount: float
     """Factor on the reward of the next step, in `discounted_future_reward`."""
     others: OthersOnRoad | None = None
-    """Boxes and bots around the cars of `steps`; None where nobody else was on the road, or where is not known."""
+    """Boxes and bots around the cars of `steps`; None where the car was alone, or their places are not known."""
     run: RunRecording | None = None
     """The records that only a run of ours has; None for a log of the service."""
 

@@ -30,7 +30,7 @@ ZIGZAG_PER_M = 1.0
 """Changes of steering a metre of straight from which on a car zig-zags: fast policies of the service's races change 0.2
 to 0.4 times, those of its first trainings 1 to 7 times."""
 ZIGZAG_DEG = 5.0
-"""Angle to either side below which nobody would see it."""
+"""Angle to either side below which it cannot be seen."""
 LEAST_M = 10.0
 """Metres of straight without which the figures say little."""
 CURE = (

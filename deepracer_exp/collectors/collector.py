@@ -308,7 +308,7 @@ def open_collector(
         run_dir: where workers leave crash dumps and prints.
         state: `state_dict` of a collector of the same configuration and setup: with the same weights, the next batch
             is what that one would have returned next, bit for bit. None or empty: new episodes begin.
-        rivals: who the cars race against; None: nobody.
+        rivals: what the cars race against; None: they are alone.
 
     Raises:
         BadInput: the state is of other cars, or of another number of processes.

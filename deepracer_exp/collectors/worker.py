@@ -41,7 +41,7 @@ class EnvFactory:
     threads: int
     run_dir: Path
     rivals: Rivals | None = None
-    """Who the cars race against; None: nobody."""
+    """What the cars race against; None: they are alone."""
     heartbeat: Path | None = None
     """File of the counted steps; None if the environment does not live in a worker process of this machine."""
     prints: RewardPrints | None = None

@@ -103,7 +103,7 @@ def recorded_race(values: Mapping[str, str]) -> RaceConfig | None:
         values: of training_params.yaml, `aws.models.job_settings.race_values`.
 
     Returns:
-        None: there is nobody else on the road, or it is not known where.
+        None: the car is alone on the road, or where the others are is not known.
 
     Raises:
         BadInput: a value is none that the service accepts.

@@ -140,8 +140,8 @@ class HeadToHead(Race):
     def drive_with(self, policies: Sequence[torch.nn.Module]) -> None:
         """Let policies drive the rivals, in each episode one of them, drawn with equal chances.
 
-        They read what the rivals observe and write `action`. Episodes that are under way go on with the policy at the
-        same share of the list.
+        They read what the rivals observe and write `action`. Episodes under way continue with the policy at the same
+        share of the list.
         """
         self._policies = policies
 
@@ -261,7 +261,7 @@ class HeadToHead(Race):
             percent = np.maximum(self._rival_percent[lost], 0.0)
             held = np.full(len(lost), pause_s)
             self.put_rivals_back(lost, percent, status[lost] == _CRASHED, None, held)
-        # Beyond the border another section may be closer: a rival goes on from its last progress on the track.
+        # Beyond the border another section may be closer: a rival continues from its last progress on the track.
         on_track = np.ones(self.n_cars, bool)
         on_track[lost] = False
         self._rival_percent = np.where(

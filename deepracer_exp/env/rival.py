@@ -26,7 +26,7 @@ class _OtherCar(Others):
 
     Attributes:
         speed_mps: how fast it drives, (N,).
-        untouchable: whether it serves a penalty, so that nobody can run into it, (N,), bool.
+        untouchable: whether it serves a penalty, so that no car can run into it, (N,), bool.
     """
 
     def __init__(self, race: RaceConfig, lanes: Lanes, tracks: Tracks, n_cars: int):
@@ -130,7 +130,7 @@ def refuse_rivals(setup: RaceSetup, what: str) -> RaceSetup:
     if setup.others is not None and setup.others.rivals is not None:
         raise BadInput(
             f"race.rivals.policy={setup.others.rivals.policy}",
-            f"{what} has nobody who drives the rival",
+            f"{what} has no policy to drive the rival",
             "another race, or deepracer-exp train",
         )
     return setup

@@ -18,7 +18,7 @@ _ENDLESS = 10**9
 class RivalProtocol:
     """Applies a protocol to the rivals of N cars, and compares them with the cars.
 
-    A rival has the penalties of the protocol, but its laps never fail and its race goes on until the car's is over.
+    A rival has the penalties of the protocol, but its laps never fail and its race lasts until the car's is over.
     """
 
     def __init__(self, config: EvaluationConfig, closed: NDArray[np.bool_], period_s: float):

@@ -21,8 +21,8 @@ DECIMALS = {
     **dict.fromkeys(("steer", "throttle", "pause_duration"), 2),
     **{"progress": 6, "tstamp": 6, "speed_mps": 3},
 }
-"""Decimals that are kept: those of the service's log lines, and more of progress and time, whose differences are used. A
-reward keeps seven digits, whatever its size. Rounded, a row takes 20 bytes instead of 63."""
+"""Decimals that are kept: those of the service's log lines, and more of progress and time, whose differences are used.
+A reward keeps seven digits, whatever its size. Rounded, a row takes 20 bytes instead of 63."""
 # Columns with few repeated values are smaller and faster to write byte-split than as dictionaries.
 _SPLIT = [name for name in DECIMALS if name not in ("track_len", "pause_duration")] + ["reward"]
 _REPEATING = [name for name in TRACE_COLUMNS if name not in _SPLIT]
@@ -95,7 +95,7 @@ def trace_files(folder: Path) -> list[Path]:
 
 
 def read_others(folder: Path, least_iteration: int = 0) -> pa.Table | None:
-    """Read where the boxes and bots of a trace were, `env.placement.SCHEMA`; None where nobody else was on the road.
+    """Read where the boxes and bots of a trace were, `env.placement.SCHEMA`; None where the car was alone.
 
     Raises:
         BadInput: a file is incomplete or of another kind.

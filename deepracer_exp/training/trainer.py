@@ -62,7 +62,7 @@ class Trainer:
         callbacks: in the order in which they are called.
         networks: policy and value.
         agent: what improves them.
-        rivals: whom it races against, None: nobody.
+        rivals: what its cars race against; None: they are alone.
         metrics: episodes and laps so far.
         budget: the limits and how much of them is used.
         checkpoints: the run's own.

@@ -111,7 +111,7 @@ def free_road(
     return columns
 
 
-def outlines(setup: RaceSetup) -> Floats:
+def object_outlines(setup: RaceSetup) -> Floats:
     """Return the corners of the others' crash rectangles in the first placement, (K, 4, 2)."""
     if setup.others is None:
         return np.zeros((0, 4, 2))

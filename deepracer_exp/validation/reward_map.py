@@ -21,7 +21,7 @@ from deepracer_exp.errors import BadInput, writing
 from deepracer_exp.tracks.drawing import area_patch
 from deepracer_exp.tracks.outline import Outline, rings_of
 
-from .objects import outlines
+from .objects import object_outlines
 from .probe import Probe
 from .situations import OFF_ROAD_M, middle_speed_mps, poses, sample, situations
 
@@ -237,7 +237,7 @@ def _draw_course(axes: Axes, setup: RaceSetup) -> None:
     axes.plot(*track.waypoints.T, color=INK, linewidth=0.8, dashes=(6, 6), alpha=0.6, zorder=3)
     halo = [withStroke(linewidth=5.5, foreground=GROUND)]
     axes.plot(*outline.start_line.T, color=INK, linewidth=3.0, zorder=4, path_effects=halo)
-    for corners in outlines(setup):
+    for corners in object_outlines(setup):
         axes.add_patch(
             Polygon(corners, fill=False, edgecolor=INK, linewidth=1.6, zorder=4, path_effects=halo)
         )

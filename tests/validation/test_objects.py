@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.validation.objects import outlines, with_others
+from deepracer_exp.validation.objects import object_outlines, with_others
 from deepracer_exp.validation.situations import named_situations
 from deepracer_exp.validation.validate import read
 
@@ -73,7 +73,7 @@ def test_situations_are_those_of_the_race_and_its_boxes_are_on_the_map():
     assert [name for name in names if "bo" in name] == [
         *("box ahead in its lane", "box ahead in the other lane", "beside a box", "in a box")
     ]
-    corners = outlines(check.setup)
+    corners = object_outlines(check.setup)
     assert corners.shape == (6, 4, 2)
     assert check.setup.track.on_road(corners.mean(axis=1)).all()
     crashed = {
@@ -87,4 +87,4 @@ def test_a_rival_counts_as_a_bot(race):
     rivals = compose_experiment(["race=head_to_head", "observation.next_objects=1"])[0].race
     others = with_others(dataclasses.replace(race, others=rivals)).others
     assert (others.boxes.count, others.bots.count, others.rivals) == (0, 1, None)
-    assert np.isfinite(outlines(with_others(dataclasses.replace(race, others=rivals)))).all()
+    assert np.isfinite(object_outlines(with_others(dataclasses.replace(race, others=rivals)))).all()

@@ -77,7 +77,7 @@ def crash_places(view: LogView) -> Chart | None:
         name="crash_places",
         title=f"Where it crashes: {len(others.crashes):,} crashes by object and place",
         caption="Each symbol is the front of the car in the step of a crash, in the colour of what it ran into. Boxes "
-        "and bots are numbered along the lap from the start line, in every episode anew."
+        "and bots are numbered along the lap from the start line, separately in each episode."
         + " The outlines are the boxes that stand at the same places in every episode."
         * bool(len(others.corners)),
         rows=[[map_panel(view.course, placed)], [waypoint_panel(counted, "crashes", n)]],
