@@ -1,4 +1,4 @@
-"""`deepracer-exp evaluate`, `watch`, `checkpoints` and `stopping`: how good a run is, and when it should have ended."""
+"""`deepracer-exp evaluate`, `check`, `watch`, `checkpoints` and `stopping`: how good a run is, when it should end."""
 
 import argparse
 import ctypes.util
@@ -53,6 +53,28 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     )
     parser.add_argument(
         "--cfg", action="store_true", help="print the composed configuration as YAML and stop"
+    )
+
+    parser = add_command(
+        commands,
+        "check",
+        _check,
+        help="check a policy before it drives the physical car",
+        description=(
+            "Say what will happen on the physical car: what it makes of each action, whether its network is fast "
+            "enough, laps and margins under each part of the car, zig-zag, and pictures that decide badly. The last "
+            "line is `ready`, or says what to do."
+        ),
+        epilog=_CHECK_EPILOG,
+        runs_rewards=True,
+        entry="evaluate",
+    )
+    add_run(parser, "checkpoint=NAME | evaluation.KEY=VALUE | KEY=VALUE")
+    parser.add_argument("--car", action="store_true", required=True, help="for the physical car")
+    parser.add_argument(
+        *("-o", "--output"),
+        metavar="FILE",
+        help="picture of the pictures that decide badly (.png; default: films/ in the run's folder)",
     )
 
     parser = add_command(
@@ -135,6 +157,36 @@ def _evaluate(args: argparse.Namespace) -> int:
     out = Console(width=None if sys.stdout.isatty() else 160)
     with warnings_on_stderr():
         evaluate_run(plan, video, out, Console(stderr=True), trace)
+    return 0
+
+
+_CHECK_EPILOG = """\
+  deepracer-exp check RUN --car                             its best checkpoint, as evaluation=real_car
+  deepracer-exp check RUN --car evaluation.real_car.timing.frames_per_s=15
+                                                            with AWS's own software
+  deepracer-exp check RUN --car evaluation.real_car.controls.full_throttle_mps=2
+                                                            with the speed that the car reaches at full throttle
+"""
+
+
+def _check(args: argparse.Namespace) -> int:
+    run, overrides = run_and_overrides(args)
+    check_file("--output", args.output, ".png")
+    named = any(override.startswith("evaluation=") for override in overrides)
+    plan = _planned(args, run, overrides if named else ["evaluation=real_car", *overrides])
+    if plan.config.evaluation.real_car is None:
+        raise BadInput(
+            "evaluation", "is not of the physical car", "evaluation=real_car, which is the default"
+        )
+    _refuse_rival(plan, "--car")
+
+    from rich.console import Console
+
+    from deepracer_exp.export.car_check import check_run
+
+    with warnings_on_stderr():
+        picture = None if args.output is None else Path(args.output)
+        check_run(plan, picture, table_console(160), Console(stderr=True))
     return 0
 
 

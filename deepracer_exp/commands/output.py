@@ -30,6 +30,7 @@ _FILES = {
 _WRITTEN = {
     "": "a file in a folder",
     ".mp4": "an .mp4 in an existing folder",
+    ".png": "a .png in an existing folder",
     ".html": "the name of a page (.html) in a folder",
 }
 """What is accepted as a file to write, by the ending that it must have."""

@@ -1,0 +1,281 @@
+"""The command `check --car`: what will happen when a policy drives the physical car, and whether it is ready for it."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+from tensordict import TensorDict
+from torch import nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from deepracer_exp.analysis.zigzag import CURE, ZIGZAG_DEG, ZIGZAG_PER_M, ZigZag
+from deepracer_exp.aws.models.car_archive import describe_commands
+from deepracer_exp.config.evaluation import EvaluationConfig
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.env.race import Race
+from deepracer_exp.env.trace import PACKED, STATUS_CODE
+from deepracer_exp.errors import RunFailed, writing
+from deepracer_exp.evaluation.evaluate import (
+    CAR,
+    CURES,
+    SIMULATOR,
+    car_figures,
+    car_protocols,
+    explain_controls,
+    write_evaluation,
+)
+from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.evaluation.film import LapRecorder, best_attempt, png
+from deepracer_exp.evaluation.plan import EvaluatePlan
+from deepracer_exp.evaluation.race_protocol import RaceProtocol
+from deepracer_exp.evaluation.result import NOTHING, USUAL, Evaluation, number
+from deepracer_exp.files import atomic_write
+from deepracer_exp.reports.picture_changes import TriedPictures, pictures_sheet, try_pictures
+from deepracer_exp.runs.files import FILMS
+from deepracer_exp.runs.result import RELIABLE
+
+from .car_archive import car_archive
+
+LEAST_ON_CAR = 0.9
+"""Share of complete laps wanted with each part of the car and with all; in the simulator it is `RELIABLE`."""
+LEAST_FACTOR = 4.0
+"""Pictures that the network must read here, on one core, in the time of one on the car, whose processor is slower."""
+MOST_BAD = 0.05
+"""Share of a lap's pictures that may decide badly."""
+_NEAR = 5
+"""Percentile of the distance to the road's edge that is shown."""
+_TIMED = 20
+
+
+@dataclass(frozen=True)
+class CarLaps:
+    """Laps with no part of the car, one of them or all."""
+
+    evaluation: Evaluation
+    edge_m: float
+    """Distance of the car's front from the nearer edge of the road, below which it is in `_NEAR` % of the steps, m;
+    NaN where it did not drive."""
+
+
+@dataclass(frozen=True)
+class CarCheck:
+    """What was found out about a policy on the car."""
+
+    laps: Mapping[str, CarLaps]
+    """Without a part of the car, with each, and with all, by the names of `car_protocols` and `CAR`."""
+    network_s: float
+    """Processor time of one decision here, on one core."""
+    frame_s: float
+    """Time between two pictures on the car."""
+    pictures: TriedPictures | None
+    """None: the policy sees with a LIDAR alone."""
+
+    @property
+    def factor(self) -> float:
+        """Return the real-time factor: decisions here in the time between two pictures on the car."""
+        return self.frame_s / self.network_s
+
+    @property
+    def zigzag(self) -> ZigZag:
+        """Return the zig-zag with all parts of the car."""
+        return self.laps[CAR].evaluation.on(USUAL).zigzag
+
+    def to_do(self) -> list[str]:
+        """Return what to do before the drive, the most important first; nothing if the policy is ready."""
+        steps = []
+        if self.factor < LEAST_FACTOR:
+            steps.append(
+                f"the network is too slow: real-time factor {self.factor:.1f}, wanted {LEAST_FACTOR:g}; train with "
+                "network=cnn_small"
+            )
+        figures = car_figures({name: laps.evaluation for name, laps in self.laps.items()})
+        shares = {name: figure["lap_share"] for name, figure in figures.items()}
+        if shares[SIMULATOR] < RELIABLE:
+            steps.append(
+                f"in the simulator {shares[SIMULATOR]:.0%} of the laps are complete, wanted {RELIABLE:.0%}; train "
+                "further (deepracer-exp clone)"
+            )
+        weak = [name for name in self.laps if name != SIMULATOR and shares[name] < LEAST_ON_CAR]
+        parts = [name for name in weak if name != CAR]
+        for name in parts or weak:
+            cure = CURES.get(name)
+            steps.append(
+                f"as on the car, {'all parts together' if name == CAR else name}: {shares[name]:.0%} of the laps are "
+                f"complete, wanted {LEAST_ON_CAR:.0%}; train with randomization=sim2real"
+                + f" ({cure})"
+                * (cure is not None)
+            )
+        changes_per_m, amplitude_deg = self.zigzag.changes_per_m, self.zigzag.amplitude_deg
+        if (changes_per_m or 0.0) >= ZIGZAG_PER_M and (amplitude_deg or 0.0) >= ZIGZAG_DEG:
+            steps.append(f"it zig-zags on straights; try {CURE}")
+        if self.pictures is not None and self.pictures.bad_share > MOST_BAD:
+            steps.append(
+                f"{self.pictures.bad_share:.0%} of the pictures decide badly, wanted {MOST_BAD:.0%}; train with the "
+                "pictures of randomization=sim2real"
+            )
+        return steps
+
+
+def check_run(plan: EvaluatePlan, picture: Path | None, out: Console, err: Console) -> CarCheck:
+    """Race a run's checkpoint as the car sees and acts, and print what will happen on the car.
+
+    Args:
+        plan: of an evaluation with `real_car`.
+        picture: file for the pictures that decide badly; None: in the run's folder.
+        out: where results are printed.
+        err: where progress is printed.
+
+    Raises:
+        BadInput: the checkpoint or a track cannot be used, or the car would refuse or misread the policy.
+        RunFailed: a car's state became NaN, or a file cannot be written.
+    """
+    run, config = plan.run, plan.config.evaluation
+    assert config.real_car is not None
+    stored, experiment = run.read_policy(), run.experiment
+    archive = car_archive(stored.networks, experiment)
+    torch.set_num_threads(1)
+    policy = stored.networks.policy
+    laps = {}
+    for name, protocol in {**car_protocols(config), CAR: config}.items():
+        err.print(
+            f"{run.path.name}, checkpoint {stored.path.name}: {_NAMES.get(name, name)}", highlight=False
+        )
+        evaluator = Evaluator(experiment, protocol)
+        edges = _Edges(evaluator)
+        laps[name] = CarLaps(evaluator(policy, edges), edges.near_m())
+    # The race of the whole car is the last one.
+    recorder = LapRecorder(evaluator, best_attempt(laps[CAR].evaluation))
+    evaluator(policy, recorder)
+    car, acted = evaluator.race.setup, recorder.acted
+    check = CarCheck(
+        laps,
+        network_time_s(policy, acted[:1]),
+        car.car.control_period_s,
+        None if experiment.observation.camera is None else try_pictures(policy, acted, car.actions),
+    )
+    evaluations = {name: driven.evaluation for name, driven in laps.items()}
+    results = write_evaluation(run.path, laps[CAR].evaluation, config, stored, evaluations)
+    out.print("What the car makes of the actions, with its maximum speed at 100%:")
+    for line in (*describe_commands(archive.metadata), *archive.notes):
+        out.print(f"  {line}", soft_wrap=True, highlight=False)
+    out.print()
+    out.print(laps_table(laps))
+    out.print()
+    out.print(figures_table(check, experiment, config))
+    if check.pictures is not None and len(check.pictures.bad):
+        file = picture or run.path / FILMS / f"{stored.path.name}-car.png"
+        camera = experiment.observation.camera
+        assert camera is not None
+        with writing(file, failure=RunFailed):
+            file.parent.mkdir(exist_ok=True)
+            atomic_write(file, png(pictures_sheet(check.pictures, policy, camera)))
+        out.print(f"  pictures  {file}", soft_wrap=True, highlight=False)
+    out.print(f"  results   {results}\n", soft_wrap=True, highlight=False)
+    steps = check.to_do()
+    if not steps:
+        out.print("ready", style="bold")
+    for step in steps:
+        out.print(f"not ready: {step}", soft_wrap=True, highlight=False)
+    return check
+
+
+_NAMES = {SIMULATOR: "in the simulator", CAR: "as on the car"}
+
+
+def laps_table(laps: Mapping[str, CarLaps]) -> Table:
+    """Return the laps and margins under each part of the car as a table."""
+    shown = Table(box=None, pad_edge=False, caption_justify="left")
+    shown.caption = (
+        f"edge cm: how near the front of the car comes to the road's edge in the nearest {_NEAR}% of the steps; below "
+        "0 it is beyond it"
+    )
+    for name in ("as on the car", "laps %", "wanted", "edge cm", "lap s", "zig-zag /m"):
+        shown.add_column(name, justify="left" if name == "as on the car" else "right", no_wrap=True)
+    figures = car_figures({name: driven.evaluation for name, driven in laps.items()})
+    names = {SIMULATOR: "nothing", CAR: "all"}
+    for name, driven in laps.items():
+        wanted = RELIABLE if name == SIMULATOR else LEAST_ON_CAR
+        shown.add_row(
+            names.get(name, name),
+            f"{100 * figures[name]['lap_share']:.0f}",
+            f"{100 * wanted:.0f}",
+            number(100 * driven.edge_m, 0),
+            number(figures[name]["lap_time_s"], 2),
+            number(driven.evaluation.on(USUAL).zigzag.changes_per_m, 2),
+        )
+    return shown
+
+
+def figures_table(check: CarCheck, experiment: Experiment, config: EvaluationConfig) -> Table:
+    """Return everything that is no lap as a table of what, on the car, wanted."""
+    shown = Table(box=None, pad_edge=False)
+    for name in ("what", "on the car", "wanted"):
+        shown.add_column(name)
+    shown.add_row(
+        "real-time factor",
+        f"{check.factor:.1f}: {1000 * check.network_s:.2f} ms a picture here on one core, "
+        f"{1000 * check.frame_s:.1f} ms between two on the car",
+        f"at least {LEAST_FACTOR:g}",
+    )
+    trained_hz = experiment.car.control_hz
+    shown.add_row("actions a second", f"{1 / check.frame_s:g}, {trained_hz:g} in the training", NOTHING)
+    for line in explain_controls(experiment, config):
+        what, _, words = line.partition(": ")
+        shown.add_row(*((what, words) if words else ("steering", line)), NOTHING)
+    shown.add_row(
+        "zig-zag on straights",
+        check.zigzag.words(),
+        f"below {ZIGZAG_PER_M:g} a metre or {ZIGZAG_DEG:g} degrees",
+    )
+    if check.pictures is not None:
+        shown.add_row("pictures that decide badly", check.pictures.words(), f"at most {MOST_BAD:.0%}")
+    return shown
+
+
+def network_time_s(policy: nn.Module, seen: TensorDict) -> float:
+    """Return the processor time of one decision, [1], the least of some: other processes only add to it."""
+    times = []
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        for _ in range(_TIMED):
+            begin = time.thread_time()
+            policy(seen.clone())
+            times.append(time.thread_time() - begin)
+    return min(times)
+
+
+class _Edges:
+    """Records how far the cars of an evaluation are from the edges of the road."""
+
+    def __init__(self, evaluator: Evaluator) -> None:
+        self._evaluator = evaluator
+        self._points: list[NDArray[np.float64]] = []
+
+    def __call__(self, race: Race, protocol: RaceProtocol, acted: TensorDict) -> None:
+        """Record one control step of the cars that drive."""
+        rows = race.trace[:, _COLUMNS]
+        drives = protocol.running & (rows[:, 2] == STATUS_CODE["in_progress"])
+        self._points.append(np.column_stack([rows[:, :2], np.where(drives, np.arange(len(rows)), -1)]))
+
+    def near_m(self) -> float:
+        """Return the distance below which the cars are in `_NEAR` % of their steps; NaN where none drove."""
+        points = np.concatenate(self._points)
+        tracks = [course.tracks[0] for course in self._evaluator.race.setup.courses]
+        of_car = np.array([trial.course for trial in self._evaluator.trials])
+        car = points[:, 2].astype(np.intp)
+        distances = []
+        for place, track in enumerate(tracks):
+            here = points[(car >= 0) & (of_car[car] == place), :2]
+            if len(here):
+                projected = track.project(here)
+                width_m = track.border_distances(here, projected.center).track_width_m
+                distances.append(0.5 * width_m - np.abs(projected.offset_m))
+        return float(np.percentile(np.concatenate(distances), _NEAR)) if distances else float("nan")
+
+
+_COLUMNS = [PACKED[name] for name in ("X", "Y", "episode_status")]
