@@ -73,8 +73,8 @@ class CarCheck:
     """Processor time of one decision here, on one core."""
     frame_s: float
     """Time between two pictures on the car."""
-    pictures: TriedPictures | None
-    """None: the policy sees with a LIDAR alone."""
+    pictures: TriedPictures
+    """Of the best lap with all parts of the car."""
 
     @property
     def factor(self) -> float:
@@ -96,25 +96,25 @@ class CarCheck:
             )
         figures = car_figures({name: laps.evaluation for name, laps in self.laps.items()})
         shares = {name: figure["lap_share"] for name, figure in figures.items()}
+        weak = [name for name in self.laps if name != SIMULATOR and shares[name] < LEAST_ON_CAR]
         if shares[SIMULATOR] < RELIABLE:
+            weak = []  # what fails in the simulator already says nothing of the car
             steps.append(
                 f"in the simulator {shares[SIMULATOR]:.0%} of the laps are complete, wanted {RELIABLE:.0%}; train "
                 "further (deepracer-exp clone)"
             )
-        weak = [name for name in self.laps if name != SIMULATOR and shares[name] < LEAST_ON_CAR]
         parts = [name for name in weak if name != CAR]
         for name in parts or weak:
             cure = CURES.get(name)
             steps.append(
                 f"as on the car, {'all parts together' if name == CAR else name}: {shares[name]:.0%} of the laps are "
                 f"complete, wanted {LEAST_ON_CAR:.0%}; train with randomization=sim2real"
-                + f" ({cure})"
-                * (cure is not None)
+                + (f" ({cure})" if cure else "")
             )
         changes_per_m, amplitude_deg = self.zigzag.changes_per_m, self.zigzag.amplitude_deg
         if (changes_per_m or 0.0) >= ZIGZAG_PER_M and (amplitude_deg or 0.0) >= ZIGZAG_DEG:
             steps.append(f"it zig-zags on straights; try {CURE}")
-        if self.pictures is not None and self.pictures.bad_share > MOST_BAD:
+        if self.pictures.bad_share > MOST_BAD:
             steps.append(
                 f"{self.pictures.bad_share:.0%} of the pictures decide badly, wanted {MOST_BAD:.0%}; train with the "
                 "pictures of randomization=sim2real"
@@ -157,7 +157,7 @@ def check_run(plan: EvaluatePlan, picture: Path | None, out: Console, err: Conso
         laps,
         network_time_s(policy, acted[:1]),
         car.car.control_period_s,
-        None if experiment.observation.camera is None else try_pictures(policy, acted, car.actions),
+        try_pictures(policy, acted, car.actions),
     )
     evaluations = {name: driven.evaluation for name, driven in laps.items()}
     results = write_evaluation(run.path, laps[CAR].evaluation, config, stored, evaluations)
@@ -166,9 +166,14 @@ def check_run(plan: EvaluatePlan, picture: Path | None, out: Console, err: Conso
         out.print(f"  {line}", soft_wrap=True, highlight=False)
     out.print()
     out.print(laps_table(laps))
-    out.print()
+    out.print(
+        f"edge cm: how near the car's front comes to the road's edge in the nearest {_NEAR}% of the steps; below 0 it "
+        "is beyond it\n",
+        soft_wrap=True,
+        highlight=False,
+    )
     out.print(figures_table(check, experiment, config))
-    if check.pictures is not None and len(check.pictures.bad):
+    if len(check.pictures.bad):
         file = picture or run.path / FILMS / f"{stored.path.name}-car.png"
         camera = experiment.observation.camera
         assert camera is not None
@@ -190,11 +195,7 @@ _NAMES = {SIMULATOR: "in the simulator", CAR: "as on the car"}
 
 def laps_table(laps: Mapping[str, CarLaps]) -> Table:
     """Return the laps and margins under each part of the car as a table."""
-    shown = Table(box=None, pad_edge=False, caption_justify="left")
-    shown.caption = (
-        f"edge cm: how near the front of the car comes to the road's edge in the nearest {_NEAR}% of the steps; below "
-        "0 it is beyond it"
-    )
+    shown = Table(box=None, pad_edge=False)
     for name in ("as on the car", "laps %", "wanted", "edge cm", "lap s", "zig-zag /m"):
         shown.add_column(name, justify="left" if name == "as on the car" else "right", no_wrap=True)
     figures = car_figures({name: driven.evaluation for name, driven in laps.items()})
@@ -233,8 +234,7 @@ def figures_table(check: CarCheck, experiment: Experiment, config: EvaluationCon
         check.zigzag.words(),
         f"below {ZIGZAG_PER_M:g} a metre or {ZIGZAG_DEG:g} degrees",
     )
-    if check.pictures is not None:
-        shown.add_row("pictures that decide badly", check.pictures.words(), f"at most {MOST_BAD:.0%}")
+    shown.add_row("pictures that decide badly", check.pictures.words(), f"at most {MOST_BAD:.0%}")
     return shown
 
 
