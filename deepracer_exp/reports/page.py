@@ -40,11 +40,11 @@ class Plot:
 
 @dataclass(frozen=True)
 class Glimpse:
-    """A policy's view in one step of a lap; both pictures as `png_uri` returns them."""
+    """A policy's view in one step of a drive; both pictures as `png_uri` returns them."""
 
     seen: str
     looked: str
-    """The picture under its saliency."""
+    """The picture under its saliency; empty where the policy is not known."""
     where: str
     decision: str
 

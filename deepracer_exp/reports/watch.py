@@ -96,7 +96,7 @@ class Frames:
         frame.paste(looked, (corner[0], corner[1] + _EYE[1]))
         draw = ImageDraw.Draw(frame, "RGBA")
         for top, words in ((0, "what it sees"), (_EYE[1], "where it looks")):
-            _label(draw, (10, top + 8), words)
+            draw_label(draw, (10, top + 8), words)
 
 
 def _fitted(size: tuple[int, int], room: tuple[int, int]) -> tuple[int, int]:
@@ -107,15 +107,16 @@ def _fitted(size: tuple[int, int], room: tuple[int, int]) -> tuple[int, int]:
 
 
 @cache
-def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+def font_of(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """Return the font of films, so many pixels high."""
     return ImageFont.load_default(size)
 
 
-def _label(draw: ImageDraw.ImageDraw, corner: tuple[int, int], words: str) -> None:
+def draw_label(draw: ImageDraw.ImageDraw, corner: tuple[int, int], words: str) -> None:
     """Write words that can be read on any picture."""
-    left, top, right, bottom = draw.textbbox((corner[0] + 7, corner[1] + 3), words, font=_font(15))
+    left, top, right, bottom = draw.textbbox((corner[0] + 7, corner[1] + 3), words, font=font_of(15))
     draw.rounded_rectangle((left - 7, top - 5, right + 7, bottom + 5), 5, fill=(0, 0, 0, 150))
-    draw.text((corner[0] + 7, corner[1] + 3), words, font=_font(15), fill=_INK)
+    draw.text((corner[0] + 7, corner[1] + 3), words, font=font_of(15), fill=_INK)
 
 
 def _board(lap: Lap, row: int, width: int) -> Image.Image:
@@ -123,13 +124,13 @@ def _board(lap: Lap, row: int, width: int) -> Image.Image:
     image = Image.new("RGB", (width, _BOARD_HEIGHT), _PAGE)
     draw = ImageDraw.Draw(image)
     share, end = lap.share(row), width - 24
-    draw.text((24, 16), lap.title, font=_font(18), fill=_INK)
+    draw.text((24, 16), lap.title, font=font_of(18), fill=_INK)
     # Right-aligned, so that the numbers do not jump.
     words = (f"{lap.time_s[row]:.2f} s", f"{max(lap.speed_mps[row], 0.0):.2f} m/s", f"{100 * share:.0f}%")
     for right, text in zip((end - 240, end - 90, end), words, strict=True):
-        draw.text((right, 12), text, font=_font(26), fill=_INK, anchor="ra")
+        draw.text((right, 12), text, font=font_of(26), fill=_INK, anchor="ra")
     if lap.held is not None and lap.held[row]:
-        draw.text((end - 340, 12), "penalty", font=_font(26), fill=_CHOSEN, anchor="ra")
+        draw.text((end - 340, 12), "penalty", font=font_of(26), fill=_CHOSEN, anchor="ra")
     draw.rounded_rectangle((24, 56, end, 64), 4, fill=_RULE)
     draw.rounded_rectangle((24, 56, 24 + max(8, (end - 24) * share), 64), 4, fill=_CHOSEN)
     return image
@@ -224,10 +225,10 @@ class _Probabilities:
         step = (self._width - 48) / len(self._order)
         top, bottom = 38, _ACTIONS_HEIGHT - 52
         draw.text(
-            (24, 12), f"probability of each action, up to {self._highest:.0%}", font=_font(15), fill=_FAINT
+            (24, 12), f"probability of each action, up to {self._highest:.0%}", font=font_of(15), fill=_FAINT
         )
         words = f"{self._steering[chosen]}, {self._speed[chosen]} m/s: {shares[chosen]:.0%}"
-        draw.text((self._width - 24, 12), words, font=_font(15), fill=_CHOSEN, anchor="ra")
+        draw.text((self._width - 24, 12), words, font=font_of(15), fill=_CHOSEN, anchor="ra")
         for y in (top, bottom):
             draw.line((24, y, self._width - 24, y), fill=_RULE)
         size = 14 if step > 40 else 11
@@ -236,8 +237,8 @@ class _Probabilities:
             height = (bottom - top) * float(shares[action]) / self._highest
             color, ink = (_CHOSEN, _CHOSEN) if action == chosen else (_BAR, _FAINT)
             draw.rectangle((middle - half, bottom - height, middle + half, bottom), fill=color)
-            draw.text((middle, bottom + 6), self._steering[action], font=_font(size), fill=ink, anchor="ma")
-            draw.text((middle, bottom + 24), self._speed[action], font=_font(size), fill=ink, anchor="ma")
+            draw.text((middle, bottom + 6), self._steering[action], font=font_of(size), fill=ink, anchor="ma")
+            draw.text((middle, bottom + 24), self._speed[action], font=font_of(size), fill=ink, anchor="ma")
         return image
 
 
@@ -254,7 +255,7 @@ class _Distribution:
         half = 0.5 * (self._high - self._low)
         means = self._low + half * (acted["loc"].numpy().clip(-1, 1) + 1)
         deviations = half * acted["scale"].numpy()
-        draw.text((24, 8), "mean and standard deviation", font=_font(15), fill=_FAINT)
+        draw.text((24, 8), "mean and standard deviation", font=font_of(15), fill=_FAINT)
         begin, end = 24, self._width - 24
         for row, (name, unit, digits) in enumerate((("steering", "°", 1), ("speed", " m/s", 2))):
             # Left is left: the steering's scale runs from its highest value down.
@@ -267,9 +268,9 @@ class _Distribution:
             draw.rounded_rectangle((low, y - 5, high, y + 5), 5, fill=_BAR)
             draw.ellipse((middle - 10, y - 10, middle + 10, y + 10), fill=_CHOSEN)
             words = f"{name} {mean:.{digits}f}{unit} ± {deviation:.{digits}f}"
-            draw.text((self._width / 2, y - 32), words, font=_font(16), fill=_INK, anchor="ma")
+            draw.text((self._width / 2, y - 32), words, font=font_of(16), fill=_INK, anchor="ma")
             for x, value, anchor in ((begin, ends[0], "la"), (end, ends[1], "ra")):
-                draw.text((x, y + 12), f"{value:g}{unit}", font=_font(13), fill=_FAINT, anchor=anchor)
+                draw.text((x, y + 12), f"{value:g}{unit}", font=font_of(13), fill=_FAINT, anchor=anchor)
         return image
 
 
