@@ -30,7 +30,7 @@ class Decisions:
     """What another policy would have done on the n pictures of a drive."""
 
     name: str
-    """Of its run."""
+    """Name of its run."""
     outputs: Floats
     """As `CarLog.outputs`, (n, k)."""
     steering: Floats
@@ -63,8 +63,8 @@ def spells(log: CarLog) -> list[Spell]:
     if not len(unsure):
         return []
     starts = np.flatnonzero(np.diff(log.time_s[unsure]) > _JOINED_S) + 1
-    found = [Spell(int(part[0]), int(part[-1])) for part in np.split(unsure, starts)]
-    return sorted(found, key=lambda spell: log.time_s[spell.first] - log.time_s[spell.last])
+    parts = [Spell(int(part[0]), int(part[-1])) for part in np.split(unsure, starts)]
+    return sorted(parts, key=lambda spell: log.time_s[spell.first] - log.time_s[spell.last])
 
 
 def action_names(log: CarLog) -> list[str]:
@@ -88,10 +88,10 @@ def side(steering: float) -> str:
 
 def in_order(log: CarLog) -> NDArray[np.intp]:
     """Return the actions from left to right as the car steered them; those that it never took come last."""
-    chosen, known = log.outputs.argmax(axis=1), np.isfinite(log.steering)
+    chosen, logged = log.outputs.argmax(axis=1), np.isfinite(log.steering)
     steering = np.full(log.outputs.shape[1], -np.inf)
-    for number in np.unique(chosen[known]):
-        steering[number] = np.median(log.steering[known & (chosen == number)])
+    for number in np.unique(chosen[logged]):
+        steering[number] = np.median(log.steering[logged & (chosen == number)])
     return np.argsort(-steering, kind="stable")
 
 
@@ -147,38 +147,38 @@ def _hesitation(log: CarLog) -> list[str]:
         return [
             "The model has continuous actions: it returns no probabilities, so no hesitation can be seen."
         ]
-    found = spells(log)
+    doubts = spells(log)
     share = float((lead(log) < UNSURE).mean())
-    if not found:
+    if not doubts:
         return [f"It never hesitates: the likeliest action leads by at least {UNSURE:.0%} on every picture."]
-    longest = found[0]
+    longest = doubts[0]
     return [
         f"It hesitates on {share:.0%} of the pictures (the likeliest action leads by less than {UNSURE:.0%}), in "
-        f"{count(len(found), 'spell')}; the longest from {log.time_s[longest.first]:.1f} to "
+        f"{count(len(doubts), 'spell')}; the longest from {log.time_s[longest.first]:.1f} to "
         f"{log.time_s[longest.last]:.1f} s."
     ]
 
 
 def _against(log: CarLog, policy: Decisions) -> list[str]:
-    found = []
+    lines = []
     if log.is_discrete and policy.outputs.shape == log.outputs.shape:
         same = (log.outputs.argmax(axis=1) == policy.outputs.argmax(axis=1)).mean()
         most = np.abs(log.outputs - policy.outputs).max()
-        found.append(
+        lines.append(
             f"{policy.name} would have taken the same action on {same:.1%} of the pictures; its probabilities differ "
             f"by {most:.2g} at most."
         )
     apart = np.abs(differences(log, policy))
-    known = np.isfinite(apart)
-    if known.any():
+    logged = np.isfinite(apart)
+    if logged.any():
         worst = int(np.nanargmax(apart))
-        found.append(
+        lines.append(
             f"{policy.name} would have steered by more than half of full lock otherwise on "
-            f"{(apart[known] > AGAINST).mean():.1%} of the pictures, by {np.nanmean(apart):.1%} on average, and by "
+            f"{(apart[logged] > AGAINST).mean():.1%} of the pictures, by {np.nanmean(apart):.1%} on average, and by "
             f"most, {side(float(policy.steering[worst]))} instead of {side(float(log.steering[worst]))}, at "
             f"{log.time_s[worst]:.1f} s."
         )
-    return found
+    return lines
 
 
 def _steering(log: CarLog) -> list[str]:
@@ -198,24 +198,24 @@ def _steering(log: CarLog) -> list[str]:
 
 def _pace(log: CarLog) -> list[str]:
     apart_s = np.diff(log.time_s)
-    found = []
+    lines = []
     if len(apart_s):
         usual_s = float(np.median(apart_s))
         gaps = apart_s > _GAP * usual_s
         if gaps.any():
-            found.append(
+            lines.append(
                 f"Pictures are missing in {count(int(gaps.sum()), 'place')}: the longest gap is {apart_s.max():.2f} s, "
                 f"at {log.time_s[int(apart_s.argmax())]:.1f} s."
             )
     latency_s = log.latency_s[np.isfinite(log.latency_s)]
     if len(latency_s):
-        found.append(
+        lines.append(
             f"A command follows its picture after {1000 * np.median(latency_s):.0f} ms (median; 95% within "
             f"{1000 * np.percentile(latency_s, 95):.0f} ms). Half a period of the servo's signal comes on top: "
             f"evaluate with evaluation.real_car.timing.frames_per_s={min(max(_frames_per_s(log), 5), 60):.0f} "
             f"evaluation.real_car.timing.latency_s={np.median(latency_s) + 0.01:.3f}."
         )
-    return found
+    return lines
 
 
 def _status(log: CarLog) -> list[str]:

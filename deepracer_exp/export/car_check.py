@@ -74,7 +74,7 @@ class CarCheck:
     frame_s: float
     """Time between two pictures on the car."""
     pictures: TriedPictures
-    """Of the best lap with all parts of the car."""
+    """The pictures of the best lap with all parts of the car."""
 
     @property
     def factor(self) -> float:

@@ -124,7 +124,7 @@ def write_drive_page(path: Path, log: CarLog, policy: DrivenPolicy | None) -> li
         OSError: the page cannot be written.
     """
     decisions = None if policy is None else policy.decisions(log)
-    found = sentences(log, decisions)
+    lines = sentences(log, decisions)
     charts = drive_charts(log, decisions)
     page = render(
         __package__,
@@ -132,14 +132,14 @@ def write_drive_page(path: Path, log: CarLog, policy: DrivenPolicy | None) -> li
         [plot_of(chart) for chart in charts],
         title=log.name,
         headline=headline(log),
-        sentences=found,
+        sentences=lines,
         problems=log.problems,
         spells=spell_table(log, decisions),
         strip=_glimpses(log, policy, decisions),
         captions={chart.name: chart.caption for chart in charts},
     )
     atomic_write(path, page)
-    return found
+    return lines
 
 
 def _glimpses(log: CarLog, policy: DrivenPolicy | None, decisions: Decisions | None) -> list[Glimpse]:

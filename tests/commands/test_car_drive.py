@@ -49,8 +49,12 @@ def test_hesitation_is_found_where_two_actions_are_nearly_as_likely_and_nowhere_
     (spell,) = spells(log)
     assert (spell.first, spell.last) == (20, 34)
     assert not spells(read_car_log(write_bag(tmp_path / "sure", drive_outputs(30))))
-    assert in_order(log).tolist() == [0, 1, 2, 3, 4]
-    assert action_names(log)[1] == "1: left 50%"
+
+
+def test_actions_are_shown_from_left_to_right_and_those_never_taken_last(bag):
+    log = read_car_log(bag)
+    assert in_order(log).tolist() == [0, 1, 3, 4, 2]
+    assert action_names(log)[1:3] == ["1: left 50%", "2"]
 
 
 def test_the_policy_that_drove_would_have_done_the_same_on_every_picture(trained, call, tmp_path):

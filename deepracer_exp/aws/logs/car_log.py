@@ -16,15 +16,13 @@ from numpy.typing import NDArray
 from deepracer_exp.errors import BadInput, reading
 from deepracer_exp.files import LOG_BYTES, open_user_file
 
-from .recording import readable
-
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 Floats = NDArray[np.float64]
 
 ENDINGS = (".db3", ".mcap")
-"""Of the files of a bag, by the storage that the car was told to use (sqlite3, its default, or mcap)."""
+"""Endings of a bag's files, by the storage that the car uses (sqlite3, its default, or mcap)."""
 ACCEPTED = "a bag that deepracer-custom-car wrote: its folder, or its .db3 or .mcap"
 RESULTS, COMMANDS = "/inference_pkg/rl_results", "/deepracer_navigation_pkg/auto_drive"
 _METADATA = "metadata.yaml"
@@ -47,7 +45,7 @@ _SERVO = "float32 angle\nfloat32 throttle\n"
 _STAMPED_SERVO = f"{_SERVO}builtin_interfaces/Time source_stamp\n"
 """AWS's own messages have no stamp."""
 _STAMPED_BYTES = 20
-"""Of a message with a stamp: 4 of its head, two numbers of 4, a time of 8."""
+"""Size of a message with a stamp: 4 of its head, two numbers of 4, a time of 8."""
 _MOST_OUTPUTS = 1000
 _LONGEST_GAP_S = 60.0
 """The car closes a bag after 15 s without a picture; a longer gap is a clock that was set meanwhile."""
@@ -176,12 +174,12 @@ def _messages(bag: Path) -> Iterator[tuple[str, str, int, Any]]:
     stamped, plain = _types(_STAMPED_SERVO), _types(_SERVO)
     for place in _storages(bag):
         with Reader(place) as reader:
-            known = [
+            connections = [
                 connection
                 for connection in reader.connections
                 if connection.msgtype in (_RESULTS_TYPE, _SERVO_TYPE, _STATUS_TYPE)
             ]
-            for connection in known:
+            for connection in connections:
                 hashes = {types.hash_rihs01(connection.msgtype) for types in (stamped, plain)}
                 if connection.digest and connection.digest not in hashes:
                     raise BadInput(
@@ -189,7 +187,7 @@ def _messages(bag: Path) -> Iterator[tuple[str, str, int, Any]]:
                         f"{connection.topic}: its messages are not those of this version of the car",
                         ACCEPTED,
                     )
-            for connection, bag_ns, data in reader.messages(known):
+            for connection, bag_ns, data in reader.messages(connections):
                 types = plain if len(data) < _STAMPED_BYTES else stamped
                 yield (
                     connection.topic,
@@ -245,6 +243,8 @@ def _nanoseconds(stamp: Any) -> int:
 def _log(
     bag: Path, decisions: Sequence[_Decision], commands: Sequence[_Command], status: Sequence[Any]
 ) -> CarLog:
+    from .recording import readable  # imports pandas, which commands that only ask `is_car_log` do not need
+
     problems = []
     if bag.is_dir() and not (bag / _METADATA).is_file():
         problems.append(f"{_METADATA} is missing: the log was cut off; what is there was read")
@@ -287,12 +287,12 @@ def _following(decisions: Sequence[_Decision], commands: Sequence[_Command]) -> 
     by_stamp = {command.stamp_ns: place for place, command in enumerate(commands) if command.stamp_ns}
     times_ns = np.array([command.bag_ns for command in commands], np.int64)
     order = np.argsort(times_ns, kind="stable")
-    found = []
+    places = []
     for decision in decisions:
         place = by_stamp.get(decision.stamp_ns, -1)
         if place < 0 and not by_stamp and len(commands):
             next_one = int(np.searchsorted(times_ns[order], decision.bag_ns - int(_BEFORE_S * 1e9)))
             if next_one < len(order) and times_ns[order[next_one]] <= decision.bag_ns + int(_AFTER_S * 1e9):
                 place = int(order[next_one])
-        found.append(place)
-    return found
+        places.append(place)
+    return places
