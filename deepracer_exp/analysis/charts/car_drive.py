@@ -51,8 +51,13 @@ def commands(log: CarLog, policy: Decisions | None) -> Chart | None:
         return None
     rows = []
     for label, driven, other, bounds in (
-        ("steering, % of full lock, left up", log.steering, policy and policy.steering, (-105.0, 105.0)),
-        ("throttle, %", log.throttle, policy and policy.throttle, (0.0, 105.0)),
+        (
+            "steering, % of full lock, left up",
+            log.steering,
+            None if policy is None else policy.steering,
+            (-105.0, 105.0),
+        ),
+        ("throttle, %", log.throttle, None if policy is None else policy.throttle, (0.0, 105.0)),
     ):
         layers: list[Layer] = []
         if other is not None:
