@@ -55,6 +55,7 @@ What can be removed:
   - the folders of runs that were deleted in MLflow
   - with --traces, the traces of finished runs, or all but the newest tenth of their iterations; analyze, report and
     watch then know only what is left, and results, checkpoints and pages stay
+  - with --replays, the replays of SAC runs that have ended; such a run cannot resume, and can be cloned as before
 
 What is never removed: checkpoints that are registered (deepracer-exp runs promote), pinned or cloned from, and runs
 that have one; runs in progress; files and folders that no training wrote, and whatever links point at.
@@ -118,6 +119,11 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         "--traces",
         choices=("thin", "drop"),
         help="list the traces of finished runs, too: all but the newest tenth of their iterations, or all",
+    )
+    clean.add_argument(
+        "--replays",
+        action="store_true",
+        help="list the replays of SAC runs that have ended, too: without its replay a run cannot resume",
     )
 
     ui = add_command(
@@ -248,7 +254,7 @@ def _promote(args: argparse.Namespace) -> int:
 def _clean(args: argparse.Namespace) -> int:
     from rich.filesize import decimal
 
-    from deepracer_exp.runs.clean import THIN, asked_traces, remove, survey, total_bytes
+    from deepracer_exp.runs.clean import DROP, THIN, asked_traces, remove, replays, survey, total_bytes
 
     stores = read_stores(args.overrides)
     runs_dir = stores.runs_dir
@@ -259,17 +265,23 @@ def _clean(args: argparse.Namespace) -> int:
     if note is not None:
         print(note, file=sys.stderr)
     clutter = survey(runs_dir, overview)
-    removable = [*clutter.removable, *asked_traces(clutter.offered, args.traces)]
+    traces, of_replays = asked_traces(clutter.offered, DROP), replays(clutter.offered)
+    removable = [*clutter.removable, *asked_traces(clutter.offered, args.traces), *of_replays * args.replays]
     _show_removable(removable, runs_dir, console)
     for reason in dict.fromkeys(reason for _, reason in clutter.kept):
         runs = [str(run.relative_to(runs_dir)) for run, why in clutter.kept if why == reason]
         more = f" and {len(runs) - 1} more" * (len(runs) > 1)
         console.print(f"kept: {runs[0]}{more}: {reason}", soft_wrap=True)
-    if args.traces is None and clutter.offered:
+    if args.traces is None and traces:
         short = asked_traces(clutter.offered, THIN)
         print(
-            f"offered: the traces of {count(len(clutter.offered), 'finished run')}: --traces drop removes "
-            f"{decimal(total_bytes(clutter.offered))}, --traces thin {decimal(total_bytes(short))}"
+            f"offered: the traces of {count(len(traces), 'finished run')}: --traces drop removes "
+            f"{decimal(total_bytes(traces))}, --traces thin {decimal(total_bytes(short))}"
+        )
+    if of_replays and not args.replays:
+        print(
+            f"offered: the replays of {count(len(of_replays), 'SAC run')} that will not resume: --replays removes "
+            f"{decimal(total_bytes(of_replays))}"
         )
     if not removable:
         print("nothing to remove")

@@ -17,6 +17,7 @@ from .files import (
     LINEAGE,
     OVERRIDES,
     PROVENANCE,
+    REPLAY,
     SUMMARY,
     TRACE,
     read_object,
@@ -29,6 +30,7 @@ from .result import FAILED, FINISHED, STOPPED_EARLY
 SPARE_CHECKPOINTS = "checkpoints neither best nor last"
 FAILED_TRACE = "trace of a failed run"
 WHOLE_TRACE, EARLY_TRACE = "trace of a finished run", "trace of a finished run, all but its newest iterations"
+WHOLE_REPLAY = "replay of a run that has ended, which then cannot resume"
 THIN, DROP = "thin", "drop"
 """Two ways to shrink the traces of finished runs."""
 ASKED = "run that was asked for"
@@ -72,7 +74,7 @@ class Removables:
     kept: list[tuple[Path, str]] = field(default_factory=list)
     """Runs with something that must be kept for now, and why."""
     offered: list[Removable] = field(default_factory=list)
-    """Traces of finished runs, which are removed only where that is asked for."""
+    """Traces of finished runs and replays of ended ones, which are removed only where that is asked for."""
 
 
 def survey(runs_dir: Path, overview: StoreOverview | None) -> Removables:
@@ -151,8 +153,10 @@ def _search(
             removables.kept.append((run, f"its other checkpoints may be needed: {error}"))
         else:
             removables.removable.append(Removable(run, SPARE_CHECKPOINTS, spare, sum(map(_size, spare))))
-    trace = run / TRACE
+    trace, replay = run / TRACE, run / REPLAY
     status = read_object(run / SUMMARY).get("status")
+    if status in (FAILED, FINISHED, STOPPED_EARLY) and _is_folder(replay):
+        removables.offered.append(Removable(run, WHOLE_REPLAY, (replay,), _size(replay)))
     if status is None or not _is_folder(trace):
         return
     if status == FAILED:
@@ -163,9 +167,15 @@ def _search(
 
 def asked_traces(offered: Sequence[Removable], how: str | None) -> list[Removable]:
     """Return what of the offered traces is to go: all of them (DROP), all but their newest part (THIN) or nothing."""
+    traces = [item for item in offered if item.what == WHOLE_TRACE]
     if how == DROP:
-        return list(offered)
-    return [early for item in offered if (early := _early(item)) is not None] if how == THIN else []
+        return traces
+    return [early for item in traces if (early := _early(item)) is not None] if how == THIN else []
+
+
+def replays(offered: Sequence[Removable]) -> list[Removable]:
+    """Return the offered replays."""
+    return [item for item in offered if item.what == WHOLE_REPLAY]
 
 
 def _early(item: Removable) -> Removable | None:

@@ -9,7 +9,16 @@ from pathlib import Path
 import pytest
 
 from deepracer_exp.runs.checkpoint_files import pin
-from deepracer_exp.runs.clean import DELETED, FAILED_TRACE, SPARE_CHECKPOINTS, remove, survey
+from deepracer_exp.runs.clean import (
+    DELETED,
+    DROP,
+    FAILED_TRACE,
+    SPARE_CHECKPOINTS,
+    asked_traces,
+    remove,
+    replays,
+    survey,
+)
 from deepracer_exp.tracking.registry import read_overview
 
 HOUR_S = 3600
@@ -69,6 +78,21 @@ def test_traces_of_failed_runs_can_go_and_of_no_others(season):
     for name, status in (("1", "finished"), ("2", "failed"), ("3", "interrupted"), ("4", "stopped early")):
         shutil.rmtree(season.run(name, status=status) / "checkpoints")
     assert listed(season) == [("2", FAILED_TRACE, ["trace"])]
+
+
+def test_replays_of_ended_runs_are_offered_and_no_others(season):
+    for name, status in (("1", "finished"), ("2", "failed"), ("3", "interrupted"), ("4", None)):
+        part = season.run(name, status=status) / "replay" / "000000000000-000000000008"
+        part.mkdir(parents=True)
+        (part / "steps.tdz").write_bytes(bytes(5000))
+        age(part.parent.parent, 2 * HOUR_S)
+    found = surveyed(season, False)
+    offered = replays(found.offered)
+    assert [(item.run.name, item.size) for item in offered] == [("1", 5000), ("2", 5000)]
+    assert "replay" not in {path.name for item in found.removable for path in item.paths}
+    assert [item.run.name for item in asked_traces(found.offered, DROP)] == ["1"]
+    assert all(map(remove, offered))
+    assert [(season.runs_dir / "season" / name / "replay").exists() for name in "123"] == [False, False, True]
 
 
 def test_a_run_deleted_in_mlflow_can_go_whole_and_an_active_one_cannot(season, client):
