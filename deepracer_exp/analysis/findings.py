@@ -316,7 +316,7 @@ def _time_lost(view: LogView) -> Finding | None:
 
 
 def _costliest(view: LogView) -> Finding | None:
-    """Say which box or bot costs most of the crashes of the last third of the iterations."""
+    """Say which of the others costs most of the crashes of the last third of the iterations, or of an evaluation."""
     if view.others is None:
         return None
     late = thirds(view.steps["iteration"].to_numpy()) == 2
@@ -324,7 +324,8 @@ def _costliest(view: LogView) -> Finding | None:
     if costs_most is None:
         return None
     sentence, values = costs_most
-    return Finding("costs_most", f"In the last third of the iterations: {sentence}", values)
+    when = "last third of the iterations" if view.trained else "evaluations"
+    return Finding("costs_most", f"In the {when}: {sentence}", values)
 
 
 def _crashes(view: LogView) -> Finding | None:

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from deepracer_exp.aws.logs.recording import TRAINING, LogProblem, Recording
 from deepracer_exp.aws.models.hyperparameters import Hyperparameters
-from deepracer_exp.env.placement import box_corners_of
+from deepracer_exp.env.placement import PlacedOthers, box_corners_of, rebuild_poses
 from deepracer_exp.errors import BadInput
-from deepracer_exp.runs.recording import RunRecording
+from deepracer_exp.runs.recording import EvaluationRecording, RunRecording
 from deepracer_exp.tracks.track import Track
 
 from .log_course import (
@@ -24,7 +24,7 @@ from .log_course import (
     numbered_as_logged,
     was_driven_on,
 )
-from .others import OthersOnRoad, others_of_log, others_on_road
+from .others import OthersOnRoad, others_on_road, placed_in_log
 from .step_columns import add_derived, first_rows, timed_by_service
 from .tables import candidates, episode_table, iteration_table
 
@@ -73,19 +73,32 @@ class LogView:
     discount: float
     """Factor on the reward of the next step, in `discounted_future_reward`."""
     others: OthersOnRoad | None = None
-    """Boxes and bots around the cars of `steps`; None where the car was alone, or their places are not known."""
+    """The others around the cars of `steps`; None where the car was alone, or their places are not known."""
+    placed: PlacedOthers | None = None
+    """Where these were in each episode."""
     run: RunRecording | None = None
     """The records that only a run of ours has; None for a log of the service."""
 
     def boxes_of(self, episode: int) -> NDArray[np.float64]:
         """Return the corners of the boxes of an episode of `steps`, (k, 4, 2); none where these are not known."""
-        run, course = self.run, self.course
-        if run is None and self.others is not None:
-            return self.others.corners
-        if run is None or run.race is None or course is None:
+        placed, course = self.placed, self.course
+        drawn = None if placed is None or course is None else placed.on(course).get(episode)
+        if placed is None or course is None or drawn is None:
             return np.zeros((0, 4, 2))
-        placed = run.placed.get(course.reversed, {}).get(episode)
-        return np.zeros((0, 4, 2)) if placed is None else box_corners_of(run.race, course, placed[0])
+        return box_corners_of(placed.race, course, drawn)
+
+    def others_at(self, rows: pd.DataFrame) -> NDArray[np.float64] | None:
+        """Return x and y of the others at rows of one episode of `steps`, (n, K, 2); None where they are not known."""
+        placed, course = self.placed, self.course
+        if placed is None or course is None:
+            return None
+        drawn = placed.on(course).get(int(rows["episode"].iloc[0]))
+        if drawn is None:
+            return None
+        step = rows["steps"].to_numpy(np.int64)
+        same = np.zeros(len(rows), np.intp)
+        poses, _ = rebuild_poses(placed.race, course, [drawn], placed.period_s, same, step)
+        return poses[..., :2]
 
     @property
     def stopping(self) -> Mapping[str, Any] | None:
@@ -204,7 +217,7 @@ def closest_waypoints(steps: pd.DataFrame) -> NDArray[np.intp]:
     return np.maximum(steps["closest_waypoint"].to_numpy(np.intp), -1)
 
 
-def prepare(log: Recording | RunRecording, track: str | None = None) -> LogView:
+def prepare(log: Recording | RunRecording | EvaluationRecording, track: str | None = None) -> LogView:
     """Prepare one course of a recording.
 
     Args:
@@ -217,7 +230,7 @@ def prepare(log: Recording | RunRecording, track: str | None = None) -> LogView:
         BadInput: the recording has no steps on the course.
     """
     run = log if isinstance(log, RunRecording) else None
-    recording = log.recording if isinstance(log, RunRecording) else log
+    recording = log if isinstance(log, Recording) else log.recording
     steps = recording.steps
     if not len(steps):
         raise BadInput(recording.name, "no control steps", "a training or a race with its trace")
@@ -252,6 +265,7 @@ def prepare(log: Recording | RunRecording, track: str | None = None) -> LogView:
     if not (here & training).any():
         trained = driven.assign(episode=np.cumsum(first_rows(driven)) - 1)
         episodes = raced.assign(episode=np.arange(len(raced)))
+    placed = placed_in_log(recording, trained, course) if isinstance(log, Recording) else log.others
     return LogView(
         name=recording.name,
         trained=bool((here & training).any()),
@@ -267,21 +281,10 @@ def prepare(log: Recording | RunRecording, track: str | None = None) -> LogView:
         laps_timed=timed + races_timed,
         problems=(*recording.problems, *problems),
         discount=discount,
-        others=_others(recording, run, trained, course),
+        others=None if placed is None or course is None else others_on_road(placed, trained, course),
+        placed=placed,
         run=run,
     )
-
-
-def _others(
-    recording: Recording, run: RunRecording | None, steps: pd.DataFrame, course: Track | None
-) -> OthersOnRoad | None:
-    if course is None:
-        return None
-    if run is None:
-        return others_of_log(recording, steps, course)
-    if run.race is None:
-        return None
-    return others_on_road(run.race, run.placed.get(course.reversed, {}), steps, course, run.period_s)
 
 
 def _episodes(

@@ -1,6 +1,5 @@
-"""Boxes and bots around the cars of a log: where they were, which of them was run into, and which was passed."""
+"""The others around the cars of a log: where they were, which of them was run into, and which was passed."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,8 +8,13 @@ from numpy.typing import NDArray
 
 from deepracer_exp.aws.logs.recording import Recording
 from deepracer_exp.config.job_race import recorded_race
-from deepracer_exp.config.race import RaceConfig
-from deepracer_exp.env.placement import Placement, box_corners_of, draw_placements, rebuild_poses
+from deepracer_exp.env.placement import (
+    PlacedOthers,
+    Placement,
+    box_corners_of,
+    draw_placements,
+    rebuild_poses,
+)
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.recording import CONTROL_PERIOD_S
 from deepracer_exp.sim.collisions import BOX_M, CAR_M, first_hit
@@ -27,8 +31,8 @@ _TOUCHED_M = 0.6
 _EPISODES = 2000
 """Episodes whose poses are rebuilt together: 100 MB with six others."""
 
-PlacedEpisodes = Mapping[int, tuple[Placement, Values]]
-"""By number of the episode: the placement, and when all bots stopped, s since the reset."""
+RIVAL = "rival"
+"""Name of the other car of a race head to head."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -36,7 +40,7 @@ class OthersOnRoad:
     """The others of a log's episodes, as far as their places are known."""
 
     names: tuple[str, ...]
-    """`box 1`, ..., `bot 1`, ...: boxes and then bots, each in the order of the lap; (K,)."""
+    """`box 1`, ..., `bot 1`, ...: boxes and then bots, each in the order of the lap, and then `RIVAL`; (K,)."""
     boxes: int
     """How many of them are boxes."""
     corners: NDArray[np.float64]
@@ -50,9 +54,11 @@ class OthersOnRoad:
     """One row each time that one fell behind a car (`overtaken`) or came past it from behind: `row`, `other`."""
 
     @property
-    def bots(self) -> int:
-        """Return how many of the others are bots."""
-        return len(self.names) - self.boxes
+    def drive(self) -> str:
+        """Return what those of the others are that drive: `a bot`, `its rival`, or nothing."""
+        if len(self.names) == self.boxes:
+            return ""
+        return f"its {RIVAL}" if self.names[-1] == RIVAL else "a bot"
 
     def table(self, rows: NDArray[np.bool_] | None = None) -> pd.DataFrame:
         """Return crashes and passes of each of the others, (K,): `crashes`, `passed`, `risk` of a crash in a meeting.
@@ -70,18 +76,15 @@ class OthersOnRoad:
         return pd.DataFrame({"crashes": crashes, "passed": over, "risk": risk}, index=list(self.names))
 
 
-def others_on_road(
-    race: RaceConfig, placed: PlacedEpisodes, steps: pd.DataFrame, course: Track, period_s: float
-) -> OthersOnRoad | None:
+def others_on_road(recorded: PlacedOthers, steps: pd.DataFrame, course: Track) -> OthersOnRoad | None:
     """Return the others around the cars of a log; None if no episode's are known.
 
     Args:
-        race: among whom the cars drove.
-        placed: the episodes whose others are known; those on the course in its direction.
+        recorded: the episodes whose others are known.
         steps: rows by episode and time with `X`, `Y`, `yaw`, `steps` and `episode_status`.
         course: that was driven on.
-        period_s: simulated seconds of a control step.
     """
+    race, placed = recorded.race, recorded.on(course)
     number = steps["episode"].to_numpy()
     first = np.flatnonzero(np.diff(number, prepend=-1) != 0)
     ends = np.append(first[1:], len(steps))
@@ -95,18 +98,19 @@ def others_on_road(
         rows = np.concatenate([np.arange(first[place], ends[place]) for place in some])
         of_episode = np.repeat(np.arange(len(some)), [ends[place] - first[place] for place in some])
         placements = [placed[int(number[first[place]])] for place in some]
-        tables = _met(race, placements, steps.iloc[rows], of_episode, course, period_s)
+        tables = _met(recorded, placements, steps.iloc[rows], of_episode, course)
         for table, collected in zip(tables, (crashes, passes), strict=True):
             collected.append(table.assign(row=rows[table["row"]]))
     boxes = race.boxes.count
     corners, lap_share = np.zeros((0, 4, 2)), np.zeros(0)
-    every = np.stack([placed[int(number[first[place]])][0].places_m[:boxes] for place in driven])
-    lanes = np.stack([placed[int(number[first[place]])][0].lanes[:boxes] for place in driven])
+    every = np.stack([placed[int(number[first[place]])].places_m[:boxes] for place in driven])
+    lanes = np.stack([placed[int(number[first[place]])].lanes[:boxes] for place in driven])
     if boxes and np.ptp(every, axis=0).max() < 1e-6 and not np.ptp(lanes, axis=0).any():
         lap_share = every[0] / course.length_m
-        corners = box_corners_of(race, course, placed[int(number[first[driven[0]]])][0])
+        corners = box_corners_of(race, course, placed[int(number[first[driven[0]]])])
     names = [f"box {number}" for number in range(1, boxes + 1)]
     names += [f"bot {number}" for number in range(1, race.bots.count + 1)]
+    names += [RIVAL] * (race.rivals is not None)
     return OthersOnRoad(
         names=tuple(names),
         boxes=boxes,
@@ -117,16 +121,18 @@ def others_on_road(
     )
 
 
-def others_of_log(recording: Recording, steps: pd.DataFrame, course: Track) -> OthersOnRoad | None:
-    """Return the others around the cars of a log of the service, as far as the parameters of its job say where.
+def placed_in_log(recording: Recording, steps: pd.DataFrame, course: Track | None) -> PlacedOthers | None:
+    """Return the others of the episodes of a log of the service, as far as the parameters of its job say where.
 
     Bots are driven by the control steps; where one has stopped because it hit the car is not logged.
 
     Args:
         recording: with the parameters about boxes and bots.
         steps: as for `others_on_road`.
-        course: that was driven on.
+        course: that was driven on; None: it is not known.
     """
+    if course is None:
+        return None
     try:
         race = recorded_race(recording.race)
     except BadInput:
@@ -135,29 +141,29 @@ def others_of_log(recording: Recording, steps: pd.DataFrame, course: Track) -> O
         return None
     length_m, first = np.array([course.length_m]), np.zeros(1, np.int64)
     places_m, lanes = draw_placements(race, length_m, first, np.zeros(1, np.uint64))
-    same = Placement(places_m[0], lanes[0], 0), np.zeros(0)
-    placed = dict.fromkeys(steps["episode"].unique().tolist(), same)
-    return others_on_road(race, placed, steps, course, CONTROL_PERIOD_S)
+    placed = dict.fromkeys(steps["episode"].unique().tolist(), Placement(places_m[0], lanes[0], 0))
+    return PlacedOthers(race=race, episodes={course.reversed: placed}, period_s=CONTROL_PERIOD_S)
 
 
 def _met(
-    race: RaceConfig,
-    placements: list[tuple[Placement, Values]],
+    recorded: PlacedOthers,
+    placements: list[Placement],
     steps: pd.DataFrame,
     of_episode: NDArray[np.intp],
     course: Track,
-    period_s: float,
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return crashes and passes of some episodes; `row` counts the rows of `steps`."""
-    step = steps["steps"].to_numpy(np.int64)
-    poses, distance_m = rebuild_poses(race, course, placements, period_s, of_episode, step)
+    race, step = recorded.race, steps["steps"].to_numpy(np.int64)
+    poses, distance_m = rebuild_poses(race, course, placements, recorded.period_s, of_episode, step)
     x, y, yaw_rad = (steps[name].to_numpy(np.float64) for name in ("X", "Y", "yaw"))
     yaw_rad = np.radians(yaw_rad)
     status = steps["episode_status"].astype(str).to_numpy()
     begins = np.append(True, np.diff(of_episode) != 0)
     crashed = np.flatnonzero((status == "crashed") & (begins | (np.append([""], status[:-1]) != "crashed")))
-    # A crash is judged by where the bots were a step before.
+    # A crash is judged by where the bots were a step before, and by where a rival is.
     lagged = poses[np.where(begins[crashed], crashed, crashed - 1)]
+    if race.rivals is not None:
+        lagged[:, -1] = poses[crashed, -1]
     origin = (
         x[crashed] - ORIGIN_BEHIND_M * np.cos(yaw_rad[crashed]),
         (y[crashed] - ORIGIN_BEHIND_M * np.sin(yaw_rad[crashed])),
@@ -166,6 +172,7 @@ def _met(
     half_m = 0.5 * np.where(is_bot[:, None], CAR_M, BOX_M)
     hit = np.asarray(first_hit(*origin, yaw_rad[crashed], lagged, half_m))
     away_m = np.hypot(lagged[..., 0] - origin[0][:, None], lagged[..., 1] - origin[1][:, None])
+    away_m[np.isnan(away_m)] = np.inf  # a rival that was not recorded
     # Recorded poses and boxes are not those of the physics to the last digit.
     hit = np.where(hit >= 0, hit, np.where(away_m.min(axis=1) < _TOUCHED_M, away_m.argmin(axis=1), -1))
     crashed, hit = crashed[hit >= 0], hit[hit >= 0]
@@ -184,7 +191,7 @@ def _met(
 def costliest(
     others: OthersOnRoad, rows: NDArray[np.bool_]
 ) -> tuple[str, dict[str, float | int | str]] | None:
-    """Return a sentence on which box or bot costs most of the crashes, and its numbers; None without a crash.
+    """Return a sentence on which of the others costs most of the crashes, and its numbers; None without a crash.
 
     `rows` are the rows of the steps that count.
     """
@@ -197,12 +204,13 @@ def costliest(
     met = int(row["crashes"] + row["passed"])
     low, high = map(float, wilson(int(row["crashes"]), met))
     where = f" (at {100 * others.lap_share[worst]:.0f}% of the lap)" if worst < len(others.lap_share) else ""
+    subject = "Its rival" if name == RIVAL else name.capitalize()
     sentence = (
-        f"{name[0].upper()}{name[1:]}{where} costs most: {int(row['crashes'])} of {crashes} crashes, a crash in "
+        f"{subject}{where} costs most: {int(row['crashes'])} of {crashes} crashes, a crash in "
         f"{row['risk']:.0%} of the {met:,} times the car came to it ({low:.0%} to {high:.0%} with 95% confidence)."
     )
-    if others.bots:
+    if others.drive:
         overtaken = int(table["passed"].iloc[others.boxes :].sum())
-        sentence += f" It overtook bots {overtaken:,} times."
+        sentence += f" It overtook {others.drive.replace('a bot', 'bots')} {overtaken:,} times."
     values: dict[str, float | int | str] = {"costs_most": name, "crashes": int(row["crashes"]), "met": met}
     return sentence, values | {"all_crashes": crashes, "risk": float(row["risk"])}

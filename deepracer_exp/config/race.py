@@ -109,11 +109,10 @@ class RaceConfig:
     rivals: RivalsConfig | None = None
 
     def __post_init__(self) -> None:
-        """Refuse boxes or bots beside a rival, which would have to meet the same ones."""
-        if self.rivals is not None and self.boxes.count + self.bots.count:
+        """Refuse bots beside a rival: the two cars would not meet them at the same places once one had stopped them."""
+        if self.rivals is not None and self.bots.count:
             raise ValueError(
-                f"rivals: race without boxes and bots, and there are {self.boxes.count + self.bots.count}; accepted: "
-                "boxes.number=0 bots.number=0, or rivals=null"
+                f"rivals: race without bots, and there are {self.bots.count}; accepted: bots.number=0, or rivals=null"
             )
 
     @property

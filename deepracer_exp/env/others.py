@@ -96,13 +96,20 @@ class RaceOthers:
         service ignores the others.
         """
         self._held_until[ids] = 0
+        return self._among_others(ids, pose, self._rules.start_ndist[ids], evaluated)
+
+    def _among_others(self, ids: Ids, pose: Pose, ndist: Floats, evaluated: bool) -> Pose:
+        """Place the boxes and bots of new episodes, and return where the cars start; arguments as for `begin`.
+
+        `ndist` is where they would start as shares of the lap, (n,).
+        """
         first = self._rules.episode[ids] <= 0
         if self._race.quirks == "fixed":
             self._place(ids)
-            return self._beside(ids, pose, np.ones(len(ids), bool))
+            return self._beside(ids, pose, ndist, np.ones(len(ids), bool))
         # The service looks at the others of the episode before.
         self._place(ids[first])
-        pose = self._beside(ids, pose, np.full(len(ids), not evaluated))
+        pose = self._beside(ids, pose, ndist, np.full(len(ids), not evaluated))
         self._place(ids[~first])
         return pose
 
@@ -237,12 +244,13 @@ class RaceOthers:
         """Return a number for the cars `ids` that their seed, number and episode decide alone, (n,)."""
         return np.asarray(episode_seeds(self._keys[ids], self._rules.episode[ids]))
 
-    def _beside(self, ids: Ids, pose: Pose, checked: Bools) -> Pose:
-        """Return start poses in the lane opposite to the nearest other where one is near, (n,) each."""
+    def _beside(self, ids: Ids, pose: Pose, ndist: Floats, checked: Bools) -> Pose:
+        """Return start poses in the lane opposite to the nearest box or bot where one is near, (n,) each."""
         rules, others = self._rules, self.others
         track_index = rules.track_index[ids]
         length_m = rules.tracks.length_m[track_index, None]
-        away_m = others.distance_m[ids] - rules.start_ndist[ids, None] * length_m
+        away_m = others.distance_m[ids, : self._race.boxes.count + self._race.bots.count]
+        away_m = away_m - ndist[:, None] * length_m
         # The service does not see across the start line.
         away_m = around(away_m, length_m) if self._race.quirks == "fixed" else away_m
         nearest = np.abs(away_m).argmin(axis=1)

@@ -1,8 +1,8 @@
-"""The placement of boxes and bots in an episode: drawn, written beside the trace, and their poses rebuilt from it."""
+"""The others of an episode: placed at random, written beside the trace, and their poses rebuilt from that."""
 
-import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 import pyarrow as pa
@@ -19,10 +19,11 @@ from deepracer_exp.tracks.track import Track, Tracks
 from .randomization import CarStreams, Purpose
 from .rules import lap_clock_s
 from .setup import RaceSetup
-from .trace import PACKED
+from .trace import OTHERS_PACKED, PACKED
 
 Floats = NDArray[np.float64]
 
+_RIVAL = ("rival_x_m", "rival_y_m", "rival_yaw_deg")
 _COLUMNS: tuple[tuple[str, pa.DataType, str], ...] = (
     ("episode", pa.int32(), "number of the episode in the trace"),
     ("car", pa.int32(), "number of the car over all processes"),
@@ -43,6 +44,14 @@ _COLUMNS: tuple[tuple[str, pa.DataType, str], ...] = (
         pa.list_(pa.float64()),
         "s since the reset: all bots stopped in these rows of the trace",
     ),
+    ("first_step", pa.int32(), "control step of the episode's first row in this iteration"),
+    (
+        "rival_x_m",
+        pa.list_(pa.float32()),
+        "m, origin of the rival at each of its rows; empty without a rival",
+    ),
+    ("rival_y_m", pa.list_(pa.float32()), "m, of the same"),
+    ("rival_yaw_deg", pa.list_(pa.float32()), "degrees, of the same"),
 )
 SCHEMA = pa.schema([pa.field(name, kind, metadata={"unit": unit}) for name, kind, unit in _COLUMNS])
 """One row for each episode that drove in an iteration."""
@@ -50,13 +59,33 @@ SCHEMA = pa.schema([pa.field(name, kind, metadata={"unit": unit}) for name, kind
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Where the others of an episode are at its begin; arrays are (K,), boxes first."""
+    """The others of an episode; arrays are (K,), boxes first and without a rival."""
 
     places_m: Floats
-    """Distances from the start line along the centre line."""
+    """Distances from the start line along the centre line, at the begin."""
     lanes: NDArray[np.int64]
     seed: int
     """Decides when bots change lanes."""
+    stopped_at_s: Floats = field(default_factory=lambda: np.zeros(0))
+    """Times since the reset at which all bots stopped, because one had hit the car."""
+    rival: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    """x and y of the rival's origin in metres and its yaw in radians at each control step from the first, (T, 3); NaN
+    where they are not recorded."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlacedOthers:
+    """The others of the episodes of a recording."""
+
+    race: RaceConfig
+    episodes: Mapping[bool, Mapping[int, Placement]]
+    """By whether the track is driven reversed, and the episode's number."""
+    period_s: float
+    """Simulated seconds of a control step."""
+
+    def on(self, track: Track) -> Mapping[int, Placement]:
+        """Return the episodes on a track in its direction, by their numbers."""
+        return self.episodes.get(track.reversed, {})
 
 
 def draw_placements(
@@ -92,49 +121,90 @@ def placements_table(setup: RaceSetup, rows: NDArray[np.float64], extra: NDArray
     Placements are drawn again from the streams of their cars, as in the processes that drove them.
 
     Args:
-        setup: of the race, which has boxes or bots.
+        setup: of the race, which has others.
         rows: the packed trace by episode and step, (n, len(PACKED)).
-        extra: the columns `trace.OTHERS_PACKED` of the same rows, (n, 2).
+        extra: the columns `trace.OTHERS_PACKED` of the same rows, and against a rival `RIVAL_PACKED`, (n, C).
     """
     assert setup.others is not None
     number = rows[:, PACKED["episode"]].astype(np.int64)
     first = np.flatnonzero(np.diff(number, prepend=-1) != 0)
-    cars, index = np.unique(rows[first, PACKED["car"]].astype(np.int64), return_inverse=True)
-    episode = extra[first, 0].astype(np.int64)
-    seeds = episode_seeds(CarStreams(setup.seed, cars.tolist(), Purpose.OTHERS).keys[index], episode)
-    courses = [setup.courses[course] for course in rows[first, PACKED["track"]].astype(np.int64).tolist()]
+    cars, episode = rows[first, PACKED["car"]].astype(np.int64), extra[first, 0].astype(np.int64)
+    keys = np.array([_key(setup.seed, car) for car in cars.tolist()], np.uint64)
+    seeds = episode_seeds(keys, episode)
     # A car stays on its course, whose directions alternate.
-    tracks = [
-        course.tracks[count % len(course.tracks)]
-        for course, count in zip(courses, episode.tolist(), strict=True)
-    ]
-    lengths_m = np.array([track.length_m for track in tracks])
+    turns = np.array([len(course.tracks) for course in setup.courses])
+    course = rows[first, PACKED["track"]].astype(np.int64)
+    track = (np.cumsum(turns) - turns)[course] + episode % turns[course]
+    tracks = [track for course in setup.courses for track in course.tracks]
+    lengths_m = np.array([track.length_m for track in tracks])[track]
     places_m, lanes = draw_placements(setup.others, lengths_m, episode, seeds)
-    written = []
-    for drawn, (row, last) in enumerate(itertools.pairwise([*first.tolist(), len(rows)])):
-        stopped = row + np.flatnonzero(extra[row:last, 1])
-        clock_s = lap_clock_s(rows[stopped, PACKED["steps"]], setup.car.control_period_s)
-        values = (
-            *(int(number[row]), int(cars[index[drawn]]), tracks[drawn].reversed, places_m[drawn].tolist()),
-            *(lanes[drawn].tolist(), int(seeds[drawn]), clock_s.tolist()),
-        )
-        written.append(dict(zip(SCHEMA.names, values, strict=True)))
-    return pa.Table.from_pylist(written, schema=SCHEMA)
+    stopped = np.flatnonzero(extra[:, 1])
+    steps = rows[:, PACKED["steps"]]
+    ends = np.append(first, len(rows))
+    rival = extra[:, len(OTHERS_PACKED) :] if extra.shape[1] > len(OTHERS_PACKED) else np.zeros((0, 3))
+    each = np.arange(len(first) + 1) * places_m.shape[1]
+    columns = [
+        *(number[first], cars, np.array([track.reversed for track in tracks])[track]),
+        *(_lists(each, places_m.ravel()), _lists(each, lanes.ravel()), seeds),
+        _lists(np.searchsorted(stopped, ends), lap_clock_s(steps[stopped], setup.car.control_period_s)),
+        steps[first],
+        *(
+            _lists(np.minimum(ends, len(rival)), values)
+            for values in (*rival[:, :2].T, np.degrees(rival[:, 2]))
+        ),
+    ]
+    return pa.Table.from_arrays(
+        [
+            (pa.array(column) if isinstance(column, np.ndarray) else column).cast(declared.type)
+            for column, declared in zip(columns, SCHEMA, strict=True)
+        ],
+        schema=SCHEMA,
+    )
 
 
-def read_placements(table: pa.Table) -> dict[bool, dict[int, tuple[Placement, Floats]]]:
-    """Return the placement of each episode of written tables, and when all bots stopped, s since the reset.
+def read_placements(table: pa.Table) -> dict[bool, dict[int, Placement]]:
+    """Return the others of each episode of written tables, which are in the order of iterations.
 
     The keys are whether the track is driven reversed, and the episode's number.
     """
-    by_way: dict[bool, dict[int, tuple[Placement, Floats]]] = {False: {}, True: {}}
-    for row in table.to_pylist():
+    by_way: dict[bool, dict[int, Placement]] = {False: {}, True: {}}
+    paths = zip(*(_parts(table[name]) for name in _RIVAL), strict=True)
+    plain = table.drop_columns([*_RIVAL]).to_pylist()
+    for row, path in zip(plain, paths, strict=True):
         episodes = by_way[row["reversed"]]
-        drawn, stopped_at_s = episodes.get(row["episode"], (None, np.zeros(0)))
-        if drawn is None:
-            drawn = Placement(np.array(row["places_m"]), np.array(row["lanes"], np.int64), row["seed"])
-        episodes[row["episode"]] = drawn, np.append(stopped_at_s, row["bots_stopped_at_s"])
+        rival = np.column_stack(path).astype(np.float64)
+        rival[:, 2] = np.radians(rival[:, 2])
+        before = episodes.get(row["episode"])
+        if before is None:
+            drawn = np.array(row["places_m"], np.float64), np.array(row["lanes"], np.int64)
+            before = Placement(*drawn, row["seed"])
+        stopped_at_s = np.append(before.stopped_at_s, row["bots_stopped_at_s"])
+        if len(rival):
+            # Files of the episode's earlier rows may have been removed.
+            missing = max(row["first_step"] - 1 - len(before.rival), 0)
+            rival = np.concatenate([before.rival, np.full((missing, 3), np.nan), rival])
+        else:
+            rival = before.rival
+        episodes[row["episode"]] = Placement(before.places_m, before.lanes, before.seed, stopped_at_s, rival)
     return by_way
+
+
+@lru_cache(maxsize=10_000)
+def _key(seed: int, car: int) -> int:
+    """Return the key of a car's stream; a stream takes longer to set up than anything else here."""
+    return int(CarStreams(seed, [car], Purpose.OTHERS).keys[0])
+
+
+def _lists(offsets: NDArray[np.intp], values: NDArray) -> pa.Array:
+    return pa.ListArray.from_arrays(pa.array(offsets.astype(np.int32)), pa.array(values))
+
+
+def _parts(column: pa.ChunkedArray) -> list[NDArray[np.float32]]:
+    """Return the entries of a column of lists, of which some may be null."""
+    filled = column.combine_chunks()
+    values = filled.flatten().to_numpy(zero_copy_only=False)
+    lengths = filled.value_lengths().fill_null(0).to_numpy(zero_copy_only=False)
+    return np.split(values, np.cumsum(lengths)[:-1]) if len(lengths) else []
 
 
 def box_corners_of(race: RaceConfig, track: Track, drawn: Placement) -> Floats:
@@ -149,20 +219,21 @@ def box_corners_of(race: RaceConfig, track: Track, drawn: Placement) -> Floats:
 def rebuild_poses(
     race: RaceConfig,
     track: Track,
-    placements: Sequence[tuple[Placement, Floats]],
+    placements: Sequence[Placement],
     period_s: float,
     episode: NDArray[np.intp],
     step: NDArray[np.int64],
 ) -> tuple[Floats, Floats]:
     """Return where the others were at rows of a trace: poses (n, K, 3) and distances along the lap in metres, (n, K).
 
-    They are driven again by the code that drove them. A row has the pose of the car at a control step and, of bots, the
-    poses of the same time; crashes and params of that step used the bots' poses of the step before, as on the service.
+    Bots are driven again by the code that drove them; a rival is where it was recorded, or NaN. A row has the pose of
+    the car at a control step and, of the others, the poses of the same time; crashes and params of that step used the
+    bots' poses of the step before, as on the service.
 
     Args:
         race: among whom the car drove.
         track: on which, in its direction.
-        placements: of each episode, with the times since its reset at which all bots stopped.
+        placements: of each episode.
         period_s: simulated seconds of a control step.
         episode: of each row, the index in `placements`, (n,).
         step: of each row, (n,), the prepare step being 1.
@@ -172,13 +243,21 @@ def rebuild_poses(
     others.place(
         everyone,
         track_index,
-        np.stack([drawn.places_m for drawn, _ in placements]),
-        np.stack([drawn.lanes for drawn, _ in placements]),
-        np.array([drawn.seed for drawn, _ in placements], np.uint64),
+        np.stack([drawn.places_m for drawn in placements]),
+        np.stack([drawn.lanes for drawn in placements]),
+        np.array([drawn.seed for drawn in placements], np.uint64),
     )
+    if not race.bots.count:
+        poses, distance_m = others.poses[episode], others.distance_m[episode]
+        if race.rivals is not None:
+            poses[:, -1] = _rival_poses(placements, episode, step)
+            known = np.isfinite(poses[:, -1, 0])
+            distance_m[:, -1] = np.nan
+            distance_m[known, -1] = track.project(poses[known, -1, :2]).distance_m
+        return poses, distance_m
     stops = np.zeros((len(placements), int(step.max(initial=0)) + 1), bool)
-    for number, (_, stopped_at_s) in enumerate(placements):
-        steps = np.round(stopped_at_s / period_s).astype(np.int64)
+    for number, drawn in enumerate(placements):
+        steps = np.round(drawn.stopped_at_s / period_s).astype(np.int64)
         stops[number, steps[steps < stops.shape[1]]] = True
     poses, distance_m = np.empty((len(step), race.others, 3)), np.empty((len(step), race.others))
     order = np.argsort(step, kind="stable")
@@ -190,6 +269,17 @@ def rebuild_poses(
         here = order[bounds[now] : bounds[now + 1]]
         poses[here], distance_m[here] = others.poses[episode[here]], others.distance_m[episode[here]]
     return poses, distance_m
+
+
+def _rival_poses(
+    placements: Sequence[Placement], episode: NDArray[np.intp], step: NDArray[np.int64]
+) -> Floats:
+    """Return the recorded poses of rivals at rows, (n, 3); the last is NaN, which stands for all that are not there."""
+    lengths = np.array([len(drawn.rival) for drawn in placements])
+    recorded = np.concatenate([*(drawn.rival for drawn in placements), np.full((1, 3), np.nan)])
+    row = (np.cumsum(lengths) - lengths)[episode] + step - 1
+    rival: Floats = recorded[np.where(step <= lengths[episode], row, -1)]
+    return rival
 
 
 def _least_m(race: RaceConfig, length_m: Floats, episode: NDArray[np.int64]) -> Floats:

@@ -25,7 +25,7 @@ from .rival import RaceRival
 from .rules import RaceRules, StepResult
 from .setup import RaceSetup
 from .state import Measures, checked_array
-from .trace import OTHERS_PACKED, PACKED, RANDOMIZED
+from .trace import OTHERS_PACKED, PACKED, RANDOMIZED, RIVAL_PACKED
 
 _RANDOMIZED = slice(PACKED[next(iter(RANDOMIZED))], PACKED[next(iter(RANDOMIZED))] + len(RANDOMIZED))
 """The columns of `RANDOMIZED`, which are adjacent in packed rows."""
@@ -59,8 +59,8 @@ class Race:
         reward: of the last step, (N,), float64.
         terminated: the last step ended the episode, (N,), bool.
         truncated: the last step cut the drive off, see `StepResult`, (N,), bool.
-        trace: one row per car for the last step, columns `env.trace.PACKED_COLUMNS` and among boxes and bots
-            `OTHERS_PACKED`, (N, C), float64.
+        trace: one row per car for the last step, columns `env.trace.PACKED_COLUMNS`, among others `OTHERS_PACKED`, and
+            against a rival `RIVAL_PACKED`, (N, C), float64.
         others: the boxes and bots on the road; None: the cars are alone.
     """
 
@@ -143,8 +143,10 @@ class Race:
         self.reward = np.zeros(n_cars)
         self.terminated = np.zeros(n_cars, bool)
         self.truncated = np.zeros(n_cars, bool)
-        extra = len(OTHERS_PACKED) if setup.others is not None and setup.others.rivals is None else 0
-        self.trace = np.zeros((n_cars, len(PACKED) + extra))
+        extra: tuple[str, ...] = () if setup.others is None else OTHERS_PACKED
+        if setup.others is not None and setup.others.rivals is not None:
+            extra += RIVAL_PACKED
+        self.trace = np.zeros((n_cars, len(PACKED) + len(extra)))
         self.trace[:, PACKED["car"]] = self.cars
         self.seed(setup.seed)
 
@@ -393,8 +395,11 @@ class Race:
         ):
             row[:, PACKED[name]] = values
         row[:, _RANDOMIZED] = self.randomization.values
-        if self.others is not None and row.shape[1] > len(PACKED):
-            row[:, len(PACKED)], row[:, len(PACKED) + 1] = rules.episode, self.others.bots_stopped
+        if self.others is not None:
+            first = len(PACKED)
+            row[:, first], row[:, first + 1] = rules.episode, self.others.bots_stopped
+            if row.shape[1] > first + len(OTHERS_PACKED):
+                row[:, first + len(OTHERS_PACKED) :] = self.others.others.poses[:, -1]
 
     def _drive(self, steering_deg: np.ndarray, speed_mps: np.ndarray, running: np.ndarray) -> None:
         self._steering_deg = np.where(running, steering_deg, 0.0)

@@ -22,10 +22,10 @@ _KEPT = ("speed_mps", "untouchable")
 
 
 class _OtherCar(Others):
-    """The one other of each of N cars, which is driven elsewhere and shown here.
+    """The boxes around each of N cars, and last another car, which is driven elsewhere and shown here.
 
     Attributes:
-        speed_mps: how fast it drives, (N,).
+        speed_mps: how fast this car drives, (N,).
         untouchable: whether it serves a penalty, so that no car can run into it, (N,), bool.
     """
 
@@ -38,12 +38,13 @@ class _OtherCar(Others):
         """Do nothing: a car that was run into drives on."""
 
     def hit(self, x_m: Floats, y_m: Floats, yaw_rad: Floats) -> NDArray[np.int64]:
-        """Return 0 for cars that have run into the other and -1 for all else, as `Others.hit` does."""
-        return np.where(self.untouchable, -1, super().hit(x_m, y_m, yaw_rad))
+        """Return what each car has run into, as `Others.hit` does."""
+        hit = super().hit(x_m, y_m, yaw_rad)
+        return np.where(self.untouchable & (hit == len(self.is_bot) - 1), -1, hit)
 
     def speeds_mps(self, ids: Ids, time_s: Floats) -> Floats:
-        """Return how fast the others of the cars `ids` drive, (n, 1)."""
-        return self.speed_mps[ids, None]
+        """Return how fast the others of the cars `ids` drive, (n, K)."""
+        return self.speed_mps[ids, None] * self.is_bot
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of all arrays."""
@@ -59,7 +60,8 @@ class _OtherCar(Others):
 class RaceRival(RaceOthers):
     """The other car of each of N cars, under the service's rules for two models (deepracer-simapp).
 
-    There is no contact. Who runs into the other from behind is at fault; the other drives on.
+    There is no contact. Who runs into the other from behind is at fault; the other drives on. Both meet the same boxes:
+    they have the same streams, and begin their episodes together.
 
     Attributes:
         is_rival: whether these cars are the rivals, whose other is the learner.
@@ -84,7 +86,7 @@ class RaceRival(RaceOthers):
         """Return where the cars start: one at its place in the outer lane, the other behind it in the inner one.
 
         The finish line of both is the place of the car in front. Who starts there is drawn, and in an evaluation
-        alternates from trial to trial.
+        alternates from trial to trial. A car that would start near a box starts in the other lane, where need be both.
         """
         self._held_until[ids] = 0
         rules = self._rules
@@ -92,8 +94,10 @@ class RaceRival(RaceOthers):
         leads = (decides % 2 == 0) != self.is_rival
         track_index = rules.track_index[ids]
         back = np.where(leads, 0.0, self._start_gap_m / rules.tracks.length_m[track_index])
-        points = rules.tracks.points_at(rules.start_ndist[ids] - back, track_index)
-        return self.lanes.poses(points, np.where(leads, OUTER, INNER), track_index)
+        ndist = np.mod(rules.start_ndist[ids] - back, 1.0)
+        points = rules.tracks.points_at(ndist, track_index)
+        pose = self.lanes.poses(points, np.where(leads, OUTER, INNER), track_index)
+        return self._among_others(ids, pose, ndist, evaluated) if self._race.boxes.count else pose
 
     def show(self, ids: Ids, cars: CarState, serving: Bools) -> None:
         """Show the cars `ids` where their others are.
@@ -106,8 +110,8 @@ class RaceRival(RaceOthers):
         rules, car = self._rules, self.others
         points = np.stack([cars.x_m[ids], cars.y_m[ids]], axis=-1)
         projection = rules.tracks.project(points, rules.track_index[ids])
-        car.poses[ids, 0, :2], car.poses[ids, 0, 2] = points, cars.yaw_rad[ids]
-        car.distance_m[ids, 0], car.offset_m[ids, 0] = projection.distance_m, projection.offset_m
+        car.poses[ids, -1, :2], car.poses[ids, -1, 2] = points, cars.yaw_rad[ids]
+        car.distance_m[ids, -1], car.offset_m[ids, -1] = projection.distance_m, projection.offset_m
         car.speed_mps[ids], car.untouchable[ids] = cars.speed_mps[ids], serving[ids]
 
     def _ahead_percent(self, own_percent: Floats, percent: Floats) -> Floats:

@@ -84,6 +84,8 @@ PACKED = {name: place for place, name in enumerate(PACKED_COLUMNS)}
 OTHERS_PACKED = ("own_episode", "bots_stopped")
 """Columns after these among boxes and bots: the number of the episode among those of its car, and whether all bots
 stopped in this step because one had hit the car."""
+RIVAL_PACKED = ("rival_x", "rival_y", "rival_yaw")
+"""Columns after these in a race against a rival: x and y of its origin in metres, and its yaw in radians."""
 SCHEMA = pa.schema([pa.field(name, kind, metadata={"unit": unit}) for name, kind, unit in _COLUMNS])
 
 

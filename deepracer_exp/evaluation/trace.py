@@ -1,10 +1,9 @@
-"""The control steps of an evaluation as the service writes them, and where the boxes and bots around them were."""
+"""The control steps of an evaluation as the service writes them, and where the others around them were."""
 
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from tensordict import TensorDict
 
@@ -14,10 +13,9 @@ from deepracer_exp.env.placement import placements_table
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.trace import EPISODE_STATUS, PACKED, STATUS_CODE, to_table
 from deepracer_exp.errors import RunFailed, writing
+from deepracer_exp.runs.trace import write_evaluation_others
 
 from .race_protocol import RaceProtocol
-
-OTHERS = "others.parquet"
 
 
 class TraceRecorder:
@@ -38,7 +36,7 @@ class TraceRecorder:
         self._running = protocol.running.copy()
 
     def write(self, folder: Path, race: Race) -> list[Path]:
-        """Write the trace, among boxes or bots also `placement.placements_table`, and return the files.
+        """Write the trace, among others also `placement.placements_table`, and return the files.
 
         Args:
             folder: new or empty.
@@ -60,8 +58,9 @@ class TraceRecorder:
             folder.mkdir(parents=True, exist_ok=True)
             files = [write_evaluation_trace(table, folder)]
             if extra.shape[1]:
-                files.append(folder / OTHERS)
-                pq.write_table(placements_table(race.setup, rows, extra), files[-1], compression="zstd")
+                assert race.setup.others is not None
+                placed = placements_table(race.setup, rows, extra)
+                files.append(write_evaluation_others(folder, placed, race.setup.others, period_s))
         return files
 
 

@@ -130,6 +130,7 @@ def _lap(view: LogView, episode: int, which: str) -> ReplayedLap:
         yaw_deg=rows["yaw"].to_numpy(np.float64),
         speed_mps=driven_speed_mps(rows["track_speed_mps"]).to_numpy(np.float64),
         steering_deg=rows["steer"].to_numpy(np.float64),
+        others=view.others_at(rows),
     )
 
 

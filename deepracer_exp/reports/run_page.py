@@ -40,7 +40,7 @@ def write_pictures(run_dir: Path, courses: Sequence[Course]) -> None:
 
         def boxes_of(track: Track, episode: int) -> NDArray[np.float64]:
             drawn = placed[track.reversed].get(episode)
-            return np.zeros((0, 4, 2)) if drawn is None else box_corners_of(race, track, drawn[0])
+            return np.zeros((0, 4, 2)) if drawn is None else box_corners_of(race, track, drawn)
 
     curves = learning_curves(pd.read_json(metrics_file, lines=True))
     for name, figure in ((BEST_LAP, driven_lines(trace, tracks, boxes_of)), (LEARNING, curves)):

@@ -11,7 +11,6 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from deepracer_exp.aws.logs import sim_trace
@@ -30,13 +29,13 @@ from deepracer_exp.config.custom_files import SAC_TAKEN, TAKEN
 from deepracer_exp.config.driving import ActionSpaceConfig
 from deepracer_exp.config.race import RaceConfig
 from deepracer_exp.env.action_space import build_action_space, metadata_of
-from deepracer_exp.env.placement import Placement, read_placements
+from deepracer_exp.env.placement import PlacedOthers, read_placements
 from deepracer_exp.env.trace import EPISODE_STATUS, SCHEMA
 from deepracer_exp.errors import BadInput
 
 from .files import CONFIG, METRICS, REWARD, SUMMARY, TRACE, is_run, read_config, read_object
 from .result import IN_TRAINING, RunResult, read_result
-from .trace import read_others, trace_files
+from .trace import read_evaluation_others, read_others, trace_files
 
 CONTROL_PERIOD_S = 1 / 15
 """The service's simulated seconds of a control step."""
@@ -79,12 +78,16 @@ class RunRecording:
     """The run's group `stopping`; None where its configuration cannot be read."""
     decision: Mapping[str, Any] | None = None
     """The decision of the stopping rule that ended the run, as in summary.json; None if no rule did."""
-    race: RaceConfig | None = None
-    """The boxes and bots of the run; None where the car was alone or the configuration cannot be read."""
-    placed: Mapping[bool, Mapping[int, tuple[Placement, NDArray[np.float64]]]] = field(default_factory=dict)
-    """Where these were in each episode (`env.placement.read_placements`), by whether the track was driven reversed."""
-    period_s: float = CONTROL_PERIOD_S
-    """Simulated seconds of a control step."""
+    others: PlacedOthers | None = None
+    """The others on the road; None where the car was alone, or they are not known."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EvaluationRecording:
+    """The control steps of an evaluation of ours among others (`evaluate --trace`)."""
+
+    recording: Recording
+    others: PlacedOthers
 
 
 def is_traced_run(folder: Path) -> bool:
@@ -92,8 +95,8 @@ def is_traced_run(folder: Path) -> bool:
     return is_run(folder) and (folder / TRACE).is_dir()
 
 
-def read_log(path: Path) -> Recording | RunRecording:
-    """Read a run of ours, or what the service or its relatives have recorded.
+def read_log(path: Path) -> Recording | RunRecording | EvaluationRecording:
+    """Read a run or an evaluation of ours, or what the service or its relatives have recorded.
 
     Raises:
         BadInput: nothing is there, or nothing of it can be read.
@@ -104,7 +107,11 @@ def read_log(path: Path) -> Recording | RunRecording:
             "has no trace: `deepracer-exp runs clean` removed it, or the run never drove",
             "a run with its trace, or logs of the service",
         )
-    return read_run_recording(path) if is_traced_run(path) else read_recording(path)
+    if is_traced_run(path):
+        return read_run_recording(path)
+    others = read_evaluation_others(path)
+    recording = read_recording(path)
+    return recording if others is None else EvaluationRecording(recording=recording, others=others)
 
 
 def read_run_recording(folder: Path) -> RunRecording:
@@ -141,7 +148,7 @@ def read_run_recording(folder: Path) -> RunRecording:
         evaluations=evaluated,
         stopping=config.get("stopping"),
         decision=_decision(folder),
-        **_others(folder, config, problems),
+        others=_others(folder, config, problems),
     )
 
 
@@ -220,19 +227,19 @@ def _metrics(
     return typed_table(UPDATE_COLUMNS, updates), typed_table(EVALUATION_COLUMNS, evaluated)
 
 
-def _others(folder: Path, config: Mapping[str, Any], problems: list[LogProblem]) -> dict[str, Any]:
-    """Return `race`, `placed` and `period_s` of a run among boxes or bots, nothing of another."""
+def _others(folder: Path, config: Mapping[str, Any], problems: list[LogProblem]) -> PlacedOthers | None:
     if config.get("race") is None:
-        return {}
+        return None
     try:
         race = _RACE.validate_python(config["race"])
         table = read_others(folder / TRACE)
     except (BadInput, ValidationError) as error:
         problems.append(LogProblem(str(folder), None, f"without boxes and bots: {_one_line(error)}"))
-        return {}
+        return None
     if table is None:
-        return {}
-    return {"race": race, "placed": read_placements(table), "period_s": 1 / config["car"]["control_hz"]}
+        return None
+    period_s = 1 / config["car"]["control_hz"]
+    return PlacedOthers(race=race, episodes=read_placements(table), period_s=period_s)
 
 
 def _decision(folder: Path) -> Mapping[str, Any] | None:

@@ -1,14 +1,19 @@
 """The files of a run's trace: one Parquet file an iteration."""
 
 import contextlib
+import json
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
+from pydantic import TypeAdapter
 
+from deepracer_exp.config.race import RaceConfig
 from deepracer_exp.env.placement import SCHEMA as OTHERS_SCHEMA
+from deepracer_exp.env.placement import PlacedOthers, read_placements
 from deepracer_exp.env.trace import SCHEMA, TRACE_COLUMNS
 from deepracer_exp.errors import BadInput, RunFailed
 
@@ -16,6 +21,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _ENDING, _OTHERS_ENDING = "-iteration.parquet", "-others.parquet"
+EVALUATION_OTHERS = "others.parquet"
+"""The others of an evaluation, beside the control steps in its folder; the file says among whom it raced."""
+_RACE: TypeAdapter[RaceConfig] = TypeAdapter(RaceConfig)
 DECIMALS = {
     **dict.fromkeys(("X", "Y", "yaw", "track_len"), 4),
     **dict.fromkeys(("steer", "throttle", "pause_duration"), 2),
@@ -95,7 +103,7 @@ def trace_files(folder: Path) -> list[Path]:
 
 
 def read_others(folder: Path, least_iteration: int = 0) -> pa.Table | None:
-    """Read where the boxes and bots of a trace were, `env.placement.SCHEMA`; None where the car was alone.
+    """Read where the others of a trace were, `env.placement.SCHEMA`; None where the car was alone.
 
     Raises:
         BadInput: a file is incomplete or of another kind.
@@ -104,14 +112,54 @@ def read_others(folder: Path, least_iteration: int = 0) -> pa.Table | None:
     for path in sorted(folder.glob(f"*{_OTHERS_ENDING}")):
         if path.name.startswith(".") or int(path.name.partition("-")[0]) < least_iteration:
             continue
-        try:
-            tables.append(pq.read_table(path).cast(OTHERS_SCHEMA))
-        except (OSError, pa.ArrowInvalid, ValueError) as error:
-            reason = " ".join(str(error).split())
-            raise BadInput(
-                path, f"not where the others were ({reason})", "a complete Parquet file of a run"
-            ) from error
+        tables.append(_read_others(path))
     return pa.concat_tables(tables) if tables else None
+
+
+def write_evaluation_others(folder: Path, table: pa.Table, race: RaceConfig, period_s: float) -> Path:
+    """Write `placement.placements_table` of an evaluation, whose control period is in seconds, and return the file.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    told = {"race": json.dumps(asdict(race)), "period_s": repr(period_s)}
+    file = folder / EVALUATION_OTHERS
+    pq.write_table(table.replace_schema_metadata(told), file, compression="zstd")
+    return file
+
+
+def read_evaluation_others(folder: Path) -> PlacedOthers | None:
+    """Read the others of an evaluation; None where the car was alone.
+
+    Raises:
+        BadInput: the file is incomplete or of another kind.
+    """
+    file = folder / EVALUATION_OTHERS
+    if not file.is_file():
+        return None
+    table = _read_others(file)
+    try:
+        told = pq.read_schema(file).metadata or {}
+        race = _RACE.validate_json(told[b"race"])
+        period_s = float(told[b"period_s"])
+    except (KeyError, ValueError) as error:
+        raise BadInput(file, "does not say among whom the car raced", "a file of evaluate --trace") from error
+    return PlacedOthers(race=race, episodes=read_placements(table), period_s=period_s)
+
+
+def _read_others(path: Path) -> pa.Table:
+    try:
+        table = pq.read_table(path)
+        # Files of races without rivals may not have their columns.
+        for field in OTHERS_SCHEMA:
+            if field.name not in table.column_names and field.name.startswith(("rival_", "first_step")):
+                table = table.append_column(field, pa.nulls(len(table), field.type))
+        return table.select(OTHERS_SCHEMA.names).cast(OTHERS_SCHEMA)
+    except (OSError, pa.ArrowInvalid, KeyError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise BadInput(
+            path, f"not where the others were ({reason})", "a complete Parquet file of a run"
+        ) from error
 
 
 def rewind_trace(folder: Path, iteration: int) -> None:

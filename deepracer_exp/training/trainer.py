@@ -215,7 +215,7 @@ class Trainer:
             self.ending = reason if isinstance(reason, Ending) else Ending(status, reason)
 
     def _write_trace(self, rows: NDArray[np.float64]) -> None:
-        """Write the steps of an iteration, and where the boxes and bots around them were."""
+        """Write the steps of an iteration, and where the others around them were."""
         extra, rows = rows[:, len(PACKED) :], rows[:, : len(PACKED)]
         self._trace.write(self.iteration, to_table(rows, self.iteration, self.metrics.track_names))
         if extra.shape[1]:

@@ -40,7 +40,7 @@ def with_others(setup: RaceSetup) -> RaceSetup:
     """Return the race with others where it has some or its reward function reads of them; a rival counts as a bot."""
     race = setup.others
     if race is not None and race.rivals is not None:
-        race = replace(ALONE, bots=replace(ALONE.bots, number=1), quirks=race.quirks)
+        race = replace(race, bots=replace(race.bots, number=1), rivals=None)
     text = setup.reward.text
     if race is None and any(f"'{key}'" in text or f'"{key}"' in text for key in OBJECT_COLUMNS):
         race = EXAMPLE if setup.track.closed else replace(EXAMPLE, bots=ALONE.bots)

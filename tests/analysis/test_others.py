@@ -13,7 +13,7 @@ from deepracer_exp.analysis.log_view import prepare
 from deepracer_exp.analysis.others import costliest, others_on_road
 from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.env.placement import Placement, rebuild_poses
+from deepracer_exp.env.placement import PlacedOthers, Placement, rebuild_poses
 from deepracer_exp.reports.log_report import LogPage, draw_sections
 from deepracer_exp.runs.recording import read_run_recording
 from deepracer_exp.tracks.track import directed_tracks
@@ -36,11 +36,11 @@ def test_every_crash_of_a_run_has_the_box_or_bot_that_the_car_is_in(mixed):
     assert (ended["episode_status"] == "crashed").all()
     assert len(ended) == (mixed.episodes["status"] == "crashed").sum() > 0
     assert others.names[:3] == ("box 1", "box 2", "bot 1")
-    placed = mixed.run.placed[False]
+    placed = mixed.placed.on(mixed.course)
     for row, other in others.crashes[["row", "other"]].to_numpy()[:40]:
         drove = steps.iloc[row]
         poses, _ = rebuild_poses(
-            mixed.run.race,
+            mixed.placed.race,
             mixed.course,
             [placed[drove["episode"]]],
             1 / 15,
@@ -95,7 +95,8 @@ def test_a_car_that_drives_a_lap_passes_every_box_once_and_slower_bots():
     steps.loc[[beside, count - 1], "episode_status"] = "crashed"
     places_m = np.array([3.0, 9.0, 14.0, *np.linspace(2, length_m - 1, 6)])
     drawn = Placement(places_m, np.arange(9) % 2, 3)
-    found = others_on_road(experiment.race, {7: (drawn, np.zeros(0))}, steps, track, 1 / 15)
+    placed = PlacedOthers(race=experiment.race, episodes={False: {7: drawn}}, period_s=1 / 15)
+    found = others_on_road(placed, steps, track)
     assert found.corners.shape == (3, 4, 2)
     np.testing.assert_allclose(found.lap_share, places_m[:3] / length_m)
     passed = found.passes[found.passes["overtaken"]]
@@ -109,7 +110,8 @@ def test_a_car_that_drives_a_lap_passes_every_box_once_and_slower_bots():
     assert sentence.startswith("Box 1 (at 13% of the lap) costs most: 1 of 1 crashes")
     assert costliest(found, np.zeros(count, bool)) is None
     # Another episode is not known.
-    assert others_on_road(experiment.race, {8: (drawn, np.zeros(0))}, steps, track, 1 / 15) is None
+    other = dataclasses.replace(placed, episodes={False: {8: drawn}})
+    assert others_on_road(other, steps, track) is None
 
 
 def test_a_log_whose_parameters_say_where_the_boxes_are_is_analysed_as_a_run_among_them(trained):
@@ -140,3 +142,22 @@ def test_each_crash_of_a_recorded_training_is_one_with_its_bot(reference, tmp_pa
     view = prepare(read_recording(tmp_path))
     assert len(view.others.crashes) == (view.episodes["status"] == "crashed").sum() == 15
     assert view.others.names == ("bot 1",)
+
+
+def test_a_report_of_a_race_head_to_head_shows_the_rival_and_the_boxes(trained):
+    options = ("race=head_to_head", "race.boxes.number=2", "observation.next_objects=2", "reward=overtake")
+    view = prepare(read_run_recording(trained(*options, "track=reInvent2019_track").folder))
+    others = view.others
+    assert others.names == ("box 1", "box 2", "rival")
+    ended = view.steps.iloc[others.crashes["row"]]
+    crashed = view.episodes["status"] == "crashed"
+    assert (ended["episode_status"] == "crashed").all()
+    assert len(ended) == crashed.sum() > 0
+    first = view.steps[view.steps["episode"] == 0]
+    x, y = view.others_at(first)[:, -1].T
+    # It starts 0.75 m ahead or behind in the other lane.
+    assert 0.5 < np.hypot(x[0] - first["X"].iloc[0], y[0] - first["Y"].iloc[0]) < 1.5
+    assert len(others.passes[others.passes["other"] == 2])
+    sections = draw_sections(LogPage(view, findings(view)))
+    (drawn,) = [chart for chart in sections[ON_ROAD] if chart.name == "overtakes"]
+    assert "its rival" in drawn.caption

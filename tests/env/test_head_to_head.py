@@ -93,6 +93,44 @@ def test_one_car_starts_behind_the_other_in_the_other_lane_and_both_places_occur
     assert (race.trace[~behind, PACKED["progress"]] >= 0).all()
 
 
+def test_both_meet_the_same_boxes_and_neither_starts_beside_one(duel):
+    race = duel("race.boxes.number=5", "race.boxes.min_distance_m=1.5", n_cars=40)
+    for _ in range(3):
+        mine, theirs = race.others.others, race.rival.others.others
+        np.testing.assert_array_equal(mine.poses[:, :5], theirs.poses[:, :5])
+        assert (np.ptp(mine.poses[:, :5, 0], axis=0) > 0).all()
+        for one in (race, race.rival):
+            boxes = one.others.others.poses[:, :5, :2]
+            here = np.stack([one.rules.now.x_m, one.rules.now.y_m], axis=-1)
+            away_m = np.linalg.norm(boxes - here[:, None], axis=-1)
+            assert away_m.min() > 0.5
+        race.step(np.tile(STOP, (40, 1)))
+        race.step(np.tile(STOP, (40, 1)))
+        assert "crashed" not in status(race) + status(race.rival)
+        race.reset()
+
+
+def test_a_box_beside_a_rival_is_met_as_without_one(duel):
+    fixed = ("race.boxes.placement=fixed", "race.boxes.positions=[{lap: 0.4, lane: inner}]")
+    race = duel(*fixed, "episode.start_advance=0", n_cars=2)
+    box = race.others.others
+    meet(race, box.distance_m[0, 0], 1.0)
+    put(race, box.distance_m[0, 0], box.offset_m[0, 0])
+    race.step(np.tile(STOP, (2, 1)))
+    assert status(race) == ["crashed", "crashed"]
+    race.reset()
+    meet(race, 1.0, box.distance_m[0, 0], box.offset_m[0, 0])
+    race._rival_percent[:] = 100 * race.rival.rules.now.ndist
+    race.step(np.tile(STOP, (2, 1)))
+    assert status(race.rival) == ["crashed", "crashed"]
+    assert race.others.serving.tolist() == [False, False]
+    # It stands 1 m before the box in the other lane, and no car can run into it.
+    shown = race.others.others
+    np.testing.assert_allclose(shown.distance_m[:, 1], box.distance_m[:, 0] - 1.0, atol=0.1)
+    assert (np.sign(shown.offset_m[:, 1]) == -np.sign(box.offset_m[:, 0])).all()
+    assert shown.untouchable.all()
+
+
 def test_each_car_sees_where_the_other_is_now(duel):
     race = duel(n_cars=4, rival=np.array([0.2, 0.5]))
     for _ in range(25):
@@ -253,7 +291,7 @@ def test_a_rival_needs_a_closed_track_and_an_empty_road(tmp_path):
     file.write_text("closed: false\nwidth_m: 1.0\nknots: [[0, 0], [1, 0], [2, 0.2], [3, 0], [4, 0]]\n")
     open_track = compose_experiment([*RACE[:2], f"track.file={file}"])[0]
     assert "no room behind its start" in refused(build_setup, open_track)
-    assert "without boxes and bots" in refused(compose_experiment, [*RACE, "race.boxes.number=2"])
+    assert "without bots" in refused(compose_experiment, [*RACE, "race.bots.number=2"])
     assert "next_objects=0" in refused(compose_experiment, ["race=head_to_head"])
     line = refused(compose_experiment, [*RACE, "race.rivals.checkpoint=last"])
     assert "checkpoint=last" in line

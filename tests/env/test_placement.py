@@ -1,8 +1,11 @@
 """What is written of boxes and bots rebuilds the poses that they had."""
 
 import numpy as np
+import pyarrow as pa
 import pytest
+import torch
 
+from deepracer_exp.env.head_to_head import HeadToHead, rival_setup
 from deepracer_exp.env.placement import SCHEMA, placements_table, read_placements, rebuild_poses
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.trace import PACKED
@@ -68,3 +71,39 @@ def test_every_pose_of_every_other_is_rebuilt_from_what_is_written(overrides):
         )
         np.testing.assert_array_equal(rebuilt, poses[here])
         np.testing.assert_array_equal(distance_m, distances[here])
+
+
+def test_the_path_of_a_rival_is_kept_beside_the_boxes_over_two_iterations():
+    sees = ("race=head_to_head", "race.boxes.number=3", SEES)
+    setup = make_setup("track=reInvent2019_track", *STANDING, *sees)
+    race = HeadToHead(setup, 4, rival_setup(setup, setup.observation))
+    race.drive_with(
+        [lambda seen: seen.set("action", torch.tensor([[0.1, 0.4]]).expand(*seen.batch_size, -1))]
+    )
+    race.reset()
+    rows, poses = [], []
+    for _ in range(30):
+        poses.append(race.others.others.poses.copy())
+        race.step(np.tile([0.0, -0.9], (4, 1)))
+        rows.append(race.trace.copy())
+    packed = np.array(rows)
+    packed[:, :, PACKED["episode"]] = np.arange(4)
+    parts = [some.swapaxes(0, 1).reshape(-1, packed.shape[-1]) for some in (packed[:12], packed[12:])]
+    tables = [placements_table(setup, some[:, : len(PACKED)], some[:, len(PACKED) :]) for some in parts]
+    placed = read_placements(pa.concat_tables(tables))[False]
+    step = np.tile(np.arange(1, 31), 4)
+    episode = np.repeat(np.arange(4), 30)
+    period_s = setup.car.control_period_s
+    drawn = [placed[number] for number in range(4)]
+    rebuilt, distance_m = rebuild_poses(setup.others, setup.track, drawn, period_s, episode, step)
+    np.testing.assert_allclose(rebuilt, np.array(poses).swapaxes(0, 1).reshape(-1, 4, 3), atol=1e-5)
+    moved_m = np.diff(distance_m[episode == 0, -1])
+    assert moved_m.max() > 0.02
+    # Of an episode whose first file is gone, the rival's path begins with the second.
+    late = read_placements(tables[1])[False]
+    rebuilt, distance_m = rebuild_poses(
+        setup.others, setup.track, [late[0]], period_s, np.zeros(30, int), step[:30]
+    )
+    assert np.isnan(rebuilt[:12, -1]).all()
+    assert np.isnan(distance_m[:12, -1]).all()
+    np.testing.assert_allclose(rebuilt[12:, -1], np.array(poses)[12:, 0, -1], atol=1e-5)

@@ -2,13 +2,20 @@
 
 import numpy as np
 import pyarrow.parquet as pq
+import pytest
 
+from deepracer_exp.analysis.findings import findings
+from deepracer_exp.analysis.log_view import prepare
 from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.env.placement import read_placements, rebuild_poses
+from deepracer_exp.env.placement import rebuild_poses
 from deepracer_exp.env.trace import STATUS_CODE
+from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.evaluation.trace import OTHERS, TraceRecorder, pauses_left_s
+from deepracer_exp.evaluation.trace import TraceRecorder, pauses_left_s
+from deepracer_exp.reports.log_report import LogPage, draw_sections
+from deepracer_exp.runs.recording import read_log
+from deepracer_exp.runs.trace import EVALUATION_OTHERS
 
 from .conftest import Driver
 
@@ -54,7 +61,9 @@ def test_the_steps_of_an_evaluation_are_written_and_every_pose_of_the_others_is_
     np.testing.assert_allclose(left_s[after + 1], 5.0 - experiment.car.control_period_s)
     assert (steps["pause_duration"].to_numpy()[status == "in_progress"] == 0).all()
     assert (steps["reward"] == 0).all()
-    placed = read_placements(pq.read_table(tmp_path / "trace" / OTHERS))[False]
+    log = read_log(tmp_path / "trace")
+    assert log.others.race == experiment.race
+    placed = log.others.episodes[False]
     episode, step = (steps[name].to_numpy(np.intp) for name in ("episode", "steps"))
     rebuilt, _ = rebuild_poses(
         experiment.race,
@@ -65,3 +74,19 @@ def test_the_steps_of_an_evaluation_are_written_and_every_pose_of_the_others_is_
         step.astype(np.int64),
     )
     np.testing.assert_array_equal(rebuilt, np.array(poses)[step - 1, episode])
+    view = prepare(log)
+    assert len(view.others.crashes) == crashes
+    assert view.others.names[3:5] == ("box 4", "bot 1")
+    (found,) = [finding for finding in findings(view) if finding.rule == "costs_most"]
+    assert found.sentence.startswith("In the evaluations: ")
+    drawn = {chart.name for some in draw_sections(LogPage(view, [])).values() for chart in some}
+    assert {"crashes_by_object", "crash_places"} <= drawn
+    np.testing.assert_allclose(view.others_at(view.steps[view.steps["episode"] == 1])[0], poses[0][1, :, :2])
+    # Without the file beside it, nothing says who was there; with another in its place, that is said.
+    file = tmp_path / "trace" / EVALUATION_OTHERS
+    plain = pq.read_table(file).replace_schema_metadata(None)
+    pq.write_table(plain, file)
+    with pytest.raises(BadInput, match="does not say among whom"):
+        read_log(tmp_path / "trace")
+    file.unlink()
+    assert prepare(read_log(tmp_path / "trace")).others is None

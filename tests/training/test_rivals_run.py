@@ -107,7 +107,7 @@ def test_a_clone_begins_its_pool_with_its_parent_s_policy(copied, call, tmp_path
         (("race.rivals.policy=SAME", "race.rivals.checkpoint=77"), ("race.rivals.policy=", "77")),
         (("race.rivals.checkpoint=last",), ("race.rivals", "checkpoint=last", "policy=RUN")),
         (("race.rivals.pool_size=0",), ("race.rivals.pool_size",)),
-        (("race.bots.number=2",), ("without boxes and bots",)),
+        (("race.bots.number=2",), ("without bots",)),
         (("observation.next_objects=0",), ("would not see",)),
     ],
     ids=lambda value: " ".join(value),

@@ -68,8 +68,8 @@ def crash_places(view: LogView) -> Chart | None:
         base = base + height
         shown = view.steps.iloc[rows[subsample(len(rows), _SHOWN)]]
         hover = [
-            f"{name}: episode {row.episode}, iteration {row.iteration}\nwaypoint {row.closest_waypoint}, "
-            f"{row.progress:.1f}% of the lap"
+            f"{name}: episode {row.episode}{f', iteration {row.iteration}' * view.trained}\n"
+            f"waypoint {row.closest_waypoint}, {row.progress:.1f}% of the lap"
             for row in shown.itertuples()
         ]
         placed.append(points(shown["X"], shown["Y"], color, symbol="triangle-up", size=6.0, hover=hover))
@@ -92,13 +92,12 @@ def crashes_by_object(view: LogView) -> Chart | None:
     late = thirds(view.steps["iteration"].to_numpy()) == 2
     layers: list[Layer] = []
     place = np.arange(len(others.names))
-    for shift, (label, rows, color) in enumerate(
-        (("all iterations", None, BLUE), ("last third of the iterations", late, GREEN))
-    ):
+    groups = [("all iterations", None, BLUE), ("last third of the iterations", late, GREEN)]
+    for shift, (label, rows, color) in enumerate(groups if view.trained else [("", None, BLUE)]):
         table = others.table(rows)
         risk = table["risk"].to_numpy()
         met = (table["crashes"] + table["passed"]).to_numpy()
-        x = place + 0.4 * shift - 0.2
+        x = place + (0.4 * shift - 0.2) * view.trained
         layers.append(bars(x, 100 * risk, color, label, width=0.36))
         low, high = wilson(table["crashes"].to_numpy(), met)
         texts = [
@@ -128,9 +127,9 @@ def crashes_by_object(view: LogView) -> Chart | None:
 
 
 def overtakes(view: LogView) -> Chart | None:
-    """Draw where the car overtakes bots, and where these come past it."""
+    """Draw where the car overtakes bots or its rival, and where these come past it."""
     others = view.others
-    if others is None or not others.bots or view.course is None:
+    if others is None or not others.drive or view.course is None:
         return None
     passes = others.passes[others.passes["other"] >= others.boxes]
     if not len(passes):
@@ -139,8 +138,8 @@ def overtakes(view: LogView) -> Chart | None:
     placed: list[Layer] = []
     counted: list[Layer] = []
     for overtaken, words, color in (
-        (True, "overtakes a bot", GREEN),
-        (False, "is passed by a bot", VERMILION),
+        (True, f"overtakes {others.drive}", GREEN),
+        (False, f"is passed by {others.drive}", VERMILION),
     ):
         rows = passes["row"].to_numpy()[passes["overtaken"] == overtaken]
         if not len(rows):
@@ -154,6 +153,6 @@ def overtakes(view: LogView) -> Chart | None:
     return Chart(
         name="overtakes",
         title="Where it overtakes",
-        caption="Each dot is the front of the car as it comes past the middle of a bot, or a bot past it.",
+        caption=f"Each dot is the front of the car as it comes past the middle of {others.drive}, or that past it.",
         rows=[[map_panel(view.course, placed)], [waypoint_panel(counted, "times", n)]],
     )
