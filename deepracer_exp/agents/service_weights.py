@@ -18,7 +18,7 @@ from deepracer_exp.aws.archives import natural
 from deepracer_exp.aws.models.model_metadata import CAMERAS, LIDARS
 from deepracer_exp.errors import BadInput
 
-from .actor_critic import CONTINUOUS_ACTION_SIZE, ActorCritic, PolicyNetworks, SensorNet
+from .actor_critic import CONTINUOUS_ACTION_SIZE, INITIAL_STD, ActorCritic, PolicyNetworks, SensorNet
 from .soft_actor_critic import BoundedGaussian
 
 Array = npt.NDArray[np.float32]
@@ -29,6 +29,10 @@ VALUE, POLICY = f"{ONLINE}/network_0", f"{ONLINE}/network_1"
 VALUE_HEAD = f"{VALUE}/v_values_head_0/output"
 POLICY_HEAD = f"{POLICY}/ppo_head_0"
 _LOG_STD = f"{POLICY_HEAD}/policy_log_std"
+SAC_HIDDEN = 256
+"""Units of the hidden layer of the head of the service's SAC policy (deepracer-simapp, `heads/sac_head.py`)."""
+_SAC_POLICY = re.compile(r"main_level/agent(?:_\d+)?/policy/(?:online|global)/network_0/(.+)")
+_SAC_HEAD = "sac_policy_head_0/"
 _RESCALER = "gradients_from_head_0-0_rescalers"
 """A factor on gradients that the service keeps among the weights of each network; always 1."""
 _LOG_STD_RANGE = (-20.0, 3.0)
@@ -107,8 +111,64 @@ def to_service(networks: PolicyNetworks, sensors: Sequence[str]) -> dict[str, Ar
     return dict(sorted(tensors.items()))
 
 
+def policy_of_sac(tensors: Mapping[str, Array], where: str) -> dict[str, Array]:
+    """Return the policy among the tensors of the service's SAC, by the names that `to_service` gives to ours.
+
+    The head of the service's policy begins with a hidden layer, here the last of the trunk; its means and the
+    logarithms of its deviations come from a layer each, ours from one. A frozen graph has no deviations: they are
+    `INITIAL_STD`.
+    The critics and the value of a state are left out: the service's see actions in degrees and metres per second.
+
+    Args:
+        tensors: by the service's names.
+        where: file of the tensors, for messages.
+
+    Raises:
+        BadInput: there is no such policy, or its head has other layers.
+    """
+    policy: dict[str, Array] = {}
+    for name, value in tensors.items():
+        match = _SAC_POLICY.fullmatch(name)
+        if match is None or _UNUSED.search(name):
+            continue
+        if match[1] in policy:
+            raise BadInput(where, f"{name}: is of a second agent", "a model of one")
+        policy[match[1]] = value
+    head = {
+        name.removeprefix(_SAC_HEAD): policy.pop(name) for name in [*policy] if name.startswith(_SAC_HEAD)
+    }
+    mean = head.get("policy_mean/kernel")
+    if mean is None or mean.ndim != 2 or "policy_mean/bias" not in head:
+        raise BadInput(
+            where, f"has no {_SAC_HEAD}policy_mean", "a model of SAC, as its model_metadata.json says"
+        )
+    layers = sorted({name.rpartition("/")[0] for name in head} - {"policy_mean"}, key=natural)
+    hidden = [layer for layer in layers if _outputs(head, layer) == len(mean) != mean.shape[1]]
+    spread = [layer for layer in layers if _outputs(head, layer) == mean.shape[1]]
+    if len(hidden) != 1 or len(spread) > 1 or len(layers) != len(hidden) + len(spread):
+        raise BadInput(
+            where, f"{_SAC_HEAD[:-1]}: has the layers {', '.join(layers)}", "a hidden layer and deviations"
+        )
+    matched = {f"{POLICY}/{name}": value for name, value in policy.items()}
+    for part in ("kernel", "bias"):
+        # Behind all others in the order of the layers.
+        matched[f"{POLICY}/middleware_fc_embedder/Dense_1000000/{part}"] = head[f"{hidden[0]}/{part}"]
+        means = head[f"policy_mean/{part}"]
+        fresh = np.full_like(means, 0.0 if part == "kernel" else np.log(INITIAL_STD))
+        deviations = head[f"{spread[0]}/{part}"] if spread else fresh
+        matched[f"{POLICY_HEAD}/policy_mean/{part}"] = np.concatenate([means, deviations], axis=-1)
+    return matched
+
+
+def _outputs(tensors: Mapping[str, Array], layer: str) -> int:
+    """Return how many outputs a dense layer has, -1 if it is none."""
+    kernel, bias = tensors.get(f"{layer}/kernel"), tensors.get(f"{layer}/bias")
+    is_dense = kernel is not None and bias is not None and kernel.ndim == 2 and bias.shape == kernel.shape[1:]
+    return kernel.shape[1] if is_dense and kernel is not None else -1
+
+
 def from_service(
-    tensors: Mapping[str, Array], networks: ActorCritic, sensors: Sequence[str], where: str
+    tensors: Mapping[str, Array], networks: PolicyNetworks, sensors: Sequence[str], where: str
 ) -> None:
     """Give networks the parameters of the service's tensors; arguments and errors as of `match_service`."""
     layers, scale = _layers(networks, sensors)
@@ -123,7 +183,7 @@ def from_service(
 
 
 def match_service(
-    tensors: Mapping[str, Array], networks: ActorCritic, sensors: Sequence[str], where: str
+    tensors: Mapping[str, Array], networks: PolicyNetworks, sensors: Sequence[str], where: str
 ) -> tuple[dict[str, Array], list[str]]:
     """Find the tensor of each parameter.
 
@@ -132,13 +192,14 @@ def match_service(
 
     Args:
         tensors: by name; of any agent (`agent`, `agent_0`), online or global.
-        networks: with separate trunks, both of which see what the service's do; also on the device `meta`.
+        networks: with separate trunks, which see what the service's do; also on the device `meta`. Of SAC, whose
+            tensors are those of `policy_of_sac`, the policy alone is matched.
         sensors: as for `to_service`.
         where: file of the tensors, for messages.
 
     Returns:
-        The tensors by the names of `to_service`; and what has none, because a frozen graph does not hold it: the value
-        network by its scope, the standard deviation by its name.
+        The tensors by the names of `to_service`; and what has none, because a frozen graph does not hold it, or SAC has
+        it otherwise: the value network by its scope, the standard deviation by its name.
 
     Raises:
         BadInput: a tensor is missing, has another shape, is not finite, or is none of these networks'.

@@ -8,9 +8,16 @@ from pathlib import Path
 
 import torch
 
-from deepracer_exp.agents.actor_critic import ActorCritic, build_actor_critic
-from deepracer_exp.agents.service_weights import VALUE, from_service, match_service
-from deepracer_exp.aws.models.archive import StoredModel, read_model
+from deepracer_exp.agents.actor_critic import PolicyNetworks
+from deepracer_exp.agents.build import build_networks
+from deepracer_exp.agents.service_weights import (
+    SAC_HIDDEN,
+    VALUE,
+    from_service,
+    match_service,
+    policy_of_sac,
+)
+from deepracer_exp.aws.models.archive import StoredModel, Tensors, read_model
 from deepracer_exp.aws.models.model_metadata import NEURAL_NETWORKS, ModelMetadata
 from deepracer_exp.config.compose import Composition, compose_experiment, compose_option
 from deepracer_exp.config.custom_files import (
@@ -26,7 +33,7 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.file_overrides import car_override
 from deepracer_exp.config.imported_options import import_files, remove_options
 from deepracer_exp.config.job_overrides import job_overrides, several_of
-from deepracer_exp.config.learning import CNNConfig
+from deepracer_exp.config.learning import CNNConfig, SACConfig
 from deepracer_exp.config.overrides import key_of, override_line
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import observation_shape
@@ -86,13 +93,6 @@ def _import(model: StoredModel, path: str, aside: str, name: str, changes: Seque
         )
     files = read_custom_files(aside)
     assert files.metadata is not None
-    if files.is_sac:
-        raise BadInput(
-            path,
-            "model_metadata.json: training_algorithm: sac: weights of SAC cannot be used",
-            f"a model of clipped_ppo, or {KEY}=DIR with its files alone, which trains a new one with "
-            "algorithm=sac_service",
-        )
     seen = sensor_overrides(files.metadata)
     experiment, composition, networks, network, absent = _fit(model, files, seen, name, changes)
     load_reward_source(experiment.reward)
@@ -117,41 +117,47 @@ def _import(model: StoredModel, path: str, aside: str, name: str, changes: Seque
 
 def _fit(
     model: StoredModel, files: CustomFiles, seen: Sequence[str], name: str, changes: Sequence[str]
-) -> tuple[Experiment, Composition, ActorCritic, list[str], list[str]]:
+) -> tuple[Experiment, Composition, PolicyNetworks, list[str], list[str]]:
     """Return the experiment with that network of the service that the weights belong to, and what is absent."""
     metadata, refused = files.metadata, None
     assert metadata is not None
-    for kind in _kinds(metadata, model):
+    tensors = policy_of_sac(model.tensors, model.source) if files.is_sac else model.tensors
+    for kind in _kinds(metadata, tensors):
         network = network_overrides(replace(metadata, neural_network=kind))
+        if files.is_sac:
+            option, _ = services_network(replace(metadata, neural_network=kind))
+            hidden = [*compose_option("network", option, CNNConfig).hidden, SAC_HIDDEN]
+            network.append(override_line("network.hidden", hidden))
         lines = [override_line(KEY, files.folder), *seen, *network, override_line("name", name), *changes]
         experiment, composition = compose_experiment(lines)
         if not isinstance(experiment.network, CNNConfig):
             raise BadInput("network", "the weights are of a network of the service; leave network= off")
+        if isinstance(experiment.algorithm, SACConfig) != files.is_sac:
+            trained = "SAC" if files.is_sac else "PPO"
+            raise BadInput("algorithm", f"the weights are of {trained}; leave algorithm= off")
         shapes = observation_shape(experiment.observation), build_action_space(experiment.action_space).n
         try:
             with torch.device("meta"):  # shapes only: the weights of a model may take gigabytes
-                networks = build_actor_critic(experiment.network, *shapes, None)
-            absent = match_service(model.tensors, networks, metadata.sensor, model.source)[1]
+                networks = build_networks(experiment.network, experiment.algorithm, *shapes, None)
+            absent = match_service(tensors, networks, metadata.sensor, model.source)[1]
         except BadInput as error:
             refused = refused or error
             continue
         if absent:
             generator = torch.Generator().manual_seed(experiment.seed)
-            networks = build_actor_critic(experiment.network, *shapes, generator)
+            networks = build_networks(experiment.network, experiment.algorithm, *shapes, generator)
         else:
             networks.to_empty(device="cpu")
-        from_service(model.tensors, networks, metadata.sensor, model.source)
+        from_service(tensors, networks, metadata.sensor, model.source)
         return experiment, composition, networks, network, absent
     assert refused is not None
     raise refused
 
 
-def _kinds(metadata: ModelMetadata, model: StoredModel) -> Iterator[str]:
+def _kinds(metadata: ModelMetadata, tensors: Tensors) -> Iterator[str]:
     """Yield the network that the metadata names, then those with the model's convolutions."""
     yield metadata.neural_network
-    held = sorted(
-        value.shape for name, value in model.tensors.items() if value.ndim == 4 and "/network_1/" in name
-    )
+    held = sorted(value.shape for name, value in tensors.items() if value.ndim == 4 and "/network_1/" in name)
     for kind in NEURAL_NETWORKS:
         if kind == metadata.neural_network:
             continue
@@ -165,7 +171,12 @@ def _kinds(metadata: ModelMetadata, model: StoredModel) -> Iterator[str]:
 
 def _remarks(files: CustomFiles, model: StoredModel, absent: Sequence[str]) -> list[str]:
     notes = []
-    if VALUE in absent:
+    if files.is_sac:
+        notes.append(
+            "of SAC the policy is used: the service's critics see actions in degrees and m/s, so that ours start "
+            "fresh, and a clone has to learn them first"
+        )
+    elif VALUE in absent:
         notes.append(
             "a frozen graph holds only the policy: the value network starts fresh, and a clone has to learn it first"
         )

@@ -15,8 +15,9 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from deepracer_exp.agents.actor_critic import build_actor_critic
-from deepracer_exp.agents.service_weights import POLICY, VALUE, to_service
+from deepracer_exp.agents.actor_critic import INITIAL_STD, build_actor_critic
+from deepracer_exp.agents.build import build_networks
+from deepracer_exp.agents.service_weights import POLICY, VALUE, policy_of_sac, to_service
 from deepracer_exp.aws.models.archive import read_model
 from deepracer_exp.aws.models.graph_def import policy_graph
 from deepracer_exp.aws.models.tf_checkpoint import write_checkpoint
@@ -112,6 +113,70 @@ def test_a_model_becomes_a_run_and_nothing_of_it_is_run(call, tmp_path, networks
     assert (tmp_path / "conf/reward/mine.py").read_text() == REWARD
     call("import", "sent", "--name", "mine", "tracking=off").assert_refused("exists already")
     assert len(list(tmp_path.glob("runs/mine/*"))) == 1
+
+
+SAC_METADATA = METADATA | {
+    "action_space": {"steering_angle": {"low": -30, "high": 30}, "speed": {"low": 0.5, "high": 1.5}},
+    "action_space_type": "continuous",
+    "training_algorithm": "sac",
+}
+SAC_FILES = {
+    "model_metadata.json": json.dumps(SAC_METADATA).encode(),
+    "ip/hyperparameters.json": b'{"lr": 0.0002, "batch_size": 32, "sac_alpha": 0.4}',
+}
+SAC_HEAD = "main_level/agent/policy/online/network_0/sac_policy_head_0"
+
+
+def services_sac(networks):
+    """Return tensors as a checkpoint of the service's SAC has them, its critics and counters among them."""
+    tensors = {}
+    for name, value in to_service(networks, SENSORS).items():
+        name = name.replace(POLICY, "main_level/agent/policy/online/network_0")
+        name = name.replace("middleware_fc_embedder/Dense_4", "sac_policy_head_0/dense")
+        tensors[name.replace("ppo_head_0", "sac_policy_head_0")] = value
+    last = networks.policy_head[0].module.layers.perceptron[-1]
+    tensors[f"{SAC_HEAD}/dense_1/kernel"] = last.weight.detach().numpy().T[:, 2:].copy()
+    tensors[f"{SAC_HEAD}/dense_1/bias"] = last.bias.detach().numpy()[2:].copy()
+    tensors[f"{SAC_HEAD}/dense/kernel/Adam"] = np.zeros((3, 3), np.float32)
+    tensors["main_level/agent/q/online/network_0/sac_q_head_0/dense/kernel"] = np.zeros((8, 4), np.float32)
+    tensors["main_level/agent/v/target/network_0/gradients_from_head_0-0_rescalers"] = np.ones((), np.float32)
+    return tensors
+
+
+@pytest.fixture(scope="module")
+def soft():
+    lines = ["observation=camera", "network=deep", "network.hidden=[256,128,256]", "algorithm=sac_service"]
+    experiment, _ = compose_experiment(lines)
+    shape = observation_shape(experiment.observation)
+    generator = torch.Generator().manual_seed(1)
+    return build_networks(experiment.network, experiment.algorithm, shape, None, generator)
+
+
+def test_a_model_of_sac_becomes_a_run_of_the_services_sac_with_its_policy(call, tmp_path, soft):
+    write_folder(tmp_path / "sent", files_of(services_sac(soft)) | SAC_FILES)
+    ended = call("import", "sent", "--name", "mine", "tracking=off")
+    assert ended.code == 0, ended.stderr
+    assert "fresh, and a clone" in " ".join(ended.stderr.split())
+    run = StoredRun(ended.folder)
+    algorithm = run.experiment.algorithm
+    assert (algorithm.alpha, algorithm.learn_alpha, algorithm.batch_size) == (0.4, False, 32)
+    found = read_checkpoint(run.experiment, run.checkpoints, "best").networks
+    for name, value in soft.policy_head.state_dict().items():
+        assert torch.equal(value, found.policy_head.state_dict()[name])
+    refused = call("import", "sent", "--name", "other", "tracking=off", "algorithm=ppo")
+    refused.assert_refused("the weights are of SAC")
+
+
+def test_a_frozen_policy_of_sac_has_fresh_deviations_and_another_head_is_named(soft):
+    tensors = {name: value for name, value in services_sac(soft).items() if "dense_1" not in name}
+    policy = policy_of_sac(tensors, "model.pb")
+    head = policy[f"{POLICY}/ppo_head_0/policy_mean/bias"]
+    np.testing.assert_allclose(np.exp(head[2:]), INITIAL_STD, rtol=1e-6)
+    assert (policy[f"{POLICY}/ppo_head_0/policy_mean/kernel"][:, 2:] == 0).all()
+    with pytest.raises(BadInput, match="has the layers"):
+        policy_of_sac({name: value for name, value in tensors.items() if "/dense/" not in name}, "model.pb")
+    with pytest.raises(BadInput, match="no sac_policy_head_0/policy_mean"):
+        policy_of_sac(to_service(soft, SENSORS), "model.pb")
 
 
 def test_a_model_of_several_tracks_is_a_run_on_all_of_them(call, tmp_path, weights):
