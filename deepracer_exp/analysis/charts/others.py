@@ -3,6 +3,7 @@
 import numpy as np
 
 from deepracer_exp.analysis.log_view import LogView, thirds
+from deepracer_exp.analysis.others import RIVAL, OthersOnRoad
 from deepracer_exp.analysis.statistics import subsample, totals, wilson
 
 from .figure import Chart, Layer, Panel, bars, line, points
@@ -76,8 +77,8 @@ def crash_places(view: LogView) -> Chart | None:
     return Chart(
         name="crash_places",
         title=f"Where it crashes: {len(others.crashes):,} crashes by object and place",
-        caption="Each symbol is the front of the car in the step of a crash, in the colour of what it ran into. Boxes "
-        "and bots are numbered along the lap from the start line, separately in each episode."
+        caption="Each symbol is the front of the car in the step of a crash, in the colour of what it ran into."
+        + _numbering(others)
         + " The outlines are the boxes that stand at the same places in every episode."
         * bool(len(others.corners)),
         rows=[[map_panel(view.course, placed)], [waypoint_panel(counted, "crashes", n)]],
@@ -117,11 +118,14 @@ def crashes_by_object(view: LogView) -> Chart | None:
                 "width": 3,
             },
         )
+    kinds = _kinds(others)
     return Chart(
         name="crashes_by_object",
-        title="Which box or bot costs most",
-        caption="Share of the times the car came to each that ended in a crash, with intervals of 95% (Wilson). Boxes "
-        "and bots are numbered along the lap from the start line.",
+        title=f"Which {' or '.join(kinds)} costs most"
+        if len(others.names) > 1
+        else f"Crashes with the {kinds[0]}",
+        caption="Share of the times the car came to each that ended in a crash, with intervals of 95% (Wilson)."
+        + _numbering(others),
         rows=[[Panel(layers=layers, y_label="crashes, per cent of meetings", x_names=list(others.names))]],
     )
 
@@ -156,3 +160,17 @@ def overtakes(view: LogView) -> Chart | None:
         caption=f"Each dot is the front of the car as it comes past the middle of {others.drive}, or that past it.",
         rows=[[map_panel(view.course, placed)], [waypoint_panel(counted, "times", n)]],
     )
+
+
+def _kinds(others: OthersOnRoad) -> list[str]:
+    """Return which kinds of others there are: `box`, `bot`, `rival`."""
+    return list(dict.fromkeys(name.split()[0] for name in others.names))
+
+
+def _numbering(others: OthersOnRoad) -> str:
+    """Return a sentence on what the numbers of boxes and bots mean, if there are any."""
+    numbered = [{"box": "boxes", "bot": "bots"}[kind] for kind in _kinds(others) if kind != RIVAL]
+    if not numbered:
+        return ""
+    words = " and ".join(numbered).capitalize()
+    return f" {words} are numbered along the lap from the start line, separately in each episode."
