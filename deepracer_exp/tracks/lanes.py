@@ -51,22 +51,19 @@ class Lanes:
             [(track.waypoints + track.outer) / 2 for track in tracks],
         ]
         self._points = lanes
-        built = [[build_segments(points) for points in lane] for lane in lanes]
-        self._lines: list[Segments] = [segments.join_segments(lane) for lane in built]
+        self._lines: Segments = segments.join_segments(
+            [build_segments(points) for lane in lanes for points in lane]
+        )
 
     def poses(self, points: Floats, lane: NDArray[np.int64], track_index: TrackIndex) -> Pose:
         """Return the poses on the lanes that are nearest to points, facing along the lane's segment; (n,) each.
 
         `lane` is `INNER` or `OUTER` and `track_index` the course of each point, (n,); points are in metres, (n, 2).
         """
-        x, y, yaw_rad = np.empty(len(points)), np.empty(len(points)), np.empty(len(points))
-        for number, line in enumerate(self._lines):
-            here = np.flatnonzero(lane == number)
-            if len(here):
-                projection = segments.project(line, track_index[here], np.ascontiguousarray(points[here]))
-                x[here], y[here] = projection[5].T
-                yaw_rad[here] = projection[6]
-        return Pose(x, y, yaw_rad)
+        line = track_index + len(self._tracks) * lane
+        projection = segments.project(self._lines, line, np.ascontiguousarray(points))
+        x, y = projection[5].T
+        return Pose(x, y, projection[6])
 
     def paths(self) -> Paths:
         """Return the paths of bots on closed courses.
