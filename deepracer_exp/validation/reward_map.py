@@ -195,6 +195,9 @@ def draw_reward_map(setup: RaceSetup, of: RewardGrid, state: State, path: Path) 
     figure.text(0.035, top, setup.reward.name, fontsize=20, fontweight="bold", color=INK, va="center")
     speed = f"{middle_speed_mps(setup):.1f} m/s"
     lines = [f"Reward on {track.title}: the map is for driving along the track at {speed}, steering straight"]
+    if setup.others is not None:
+        kinds = ["boxes"] * (setup.others.boxes.count > 0) + ["bots"] * (setup.others.bots.count > 0)
+        lines[0] += f"; outlined: {' and '.join(kinds)} as an episode begins"
     if state == "earlier calls":
         lines.append("It depends on earlier calls: each point follows one step of driving there")
     elif state == "randomness":
