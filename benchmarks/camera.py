@@ -34,7 +34,8 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.picture_randomization import PictureRandomization
 from deepracer_exp.env.pictures import GREY, floor_colors
 from deepracer_exp.errors import BadInput
-from deepracer_exp.sim.camera import Lens, take_pictures
+from deepracer_exp.sim.camera import take_pictures
+from deepracer_exp.sim.lens import Lens
 from deepracer_exp.sim.scenery import MATERIALS, Scenery, build_scenery
 from deepracer_exp.tracks.track import Track, world_track
 

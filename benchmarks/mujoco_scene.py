@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from shapely.affinity import affine_transform
 from shapely.geometry.base import BaseGeometry
 
-from deepracer_exp.sim.camera import FACE_LIGHT, Lens
+from deepracer_exp.sim.camera_boxes import FACE_LIGHT
+from deepracer_exp.sim.lens import Lens
 from deepracer_exp.sim.scenery import (
     DASH_WIDTH_M,
     KERB_GAP_M,

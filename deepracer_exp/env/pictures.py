@@ -10,7 +10,8 @@ from deepracer_exp.config.driving import CameraConfig
 from deepracer_exp.config.evaluation import CarPictureConfig
 from deepracer_exp.config.track import FloorConfig
 from deepracer_exp.sim.batch import CarState
-from deepracer_exp.sim.camera import Lens, take_pictures
+from deepracer_exp.sim.camera import take_pictures
+from deepracer_exp.sim.lens import Lens
 from deepracer_exp.sim.scenery import MATERIALS, build_scenery, join_sceneries
 from deepracer_exp.tracks.track import Track
 

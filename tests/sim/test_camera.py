@@ -9,7 +9,9 @@ import shapely
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from deepracer_exp.sim.camera import FACE_LIGHT, NEAREST_M, Lens, take_pictures
+from deepracer_exp.sim.camera import take_pictures
+from deepracer_exp.sim.camera_boxes import FACE_LIGHT
+from deepracer_exp.sim.lens import NEAREST_M, Lens
 from deepracer_exp.sim.scenery import (
     CURVES_UNTIL_M,
     DASH_WIDTH_M,
