@@ -251,9 +251,9 @@ def rebuild_poses(
         poses, distance_m = others.poses[episode], others.distance_m[episode]
         if race.rivals is not None:
             poses[:, -1] = _rival_poses(placements, episode, step)
-            known = np.isfinite(poses[:, -1, 0])
+            recorded = np.isfinite(poses[:, -1, 0])
             distance_m[:, -1] = np.nan
-            distance_m[known, -1] = track.project(poses[known, -1, :2]).distance_m
+            distance_m[recorded, -1] = track.project(poses[recorded, -1, :2]).distance_m
         return poses, distance_m
     stops = np.zeros((len(placements), int(step.max(initial=0)) + 1), bool)
     for number, drawn in enumerate(placements):

@@ -122,9 +122,9 @@ def write_evaluation_others(folder: Path, table: pa.Table, race: RaceConfig, per
     Raises:
         OSError: it cannot be written.
     """
-    told = {"race": json.dumps(asdict(race)), "period_s": repr(period_s)}
+    written = {"race": json.dumps(asdict(race)), "period_s": repr(period_s)}
     file = folder / EVALUATION_OTHERS
-    pq.write_table(table.replace_schema_metadata(told), file, compression="zstd")
+    pq.write_table(table.replace_schema_metadata(written), file, compression="zstd")
     return file
 
 
@@ -139,9 +139,9 @@ def read_evaluation_others(folder: Path) -> PlacedOthers | None:
         return None
     table = _read_others(file)
     try:
-        told = pq.read_schema(file).metadata or {}
-        race = _RACE.validate_json(told[b"race"])
-        period_s = float(told[b"period_s"])
+        written = pq.read_schema(file).metadata or {}
+        race = _RACE.validate_json(written[b"race"])
+        period_s = float(written[b"period_s"])
     except (KeyError, ValueError) as error:
         raise BadInput(file, "does not say among whom the car raced", "a file of evaluate --trace") from error
     return PlacedOthers(race=race, episodes=read_placements(table), period_s=period_s)

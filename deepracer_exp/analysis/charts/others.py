@@ -157,7 +157,8 @@ def overtakes(view: LogView) -> Chart | None:
     return Chart(
         name="overtakes",
         title="Where it overtakes",
-        caption=f"Each dot is the front of the car as it comes past the middle of {others.drive}, or that past it.",
+        caption=f"Each dot is the front of the car where it gets ahead of {others.drive}, or falls behind."
+        + " A rival may stand there, because it has left the track." * (RIVAL in others.names),
         rows=[[map_panel(view.course, placed)], [waypoint_panel(counted, "times", n)]],
     )
 
