@@ -204,6 +204,9 @@ Distortion = Annotated[float, Field(ge=-0.3, le=0.3, allow_inf_nan=False)]
 
 # Beyond, a policy would learn other clearances than the crash rule has.
 OthersScale = Annotated[float, Field(ge=0.7, le=1.4, allow_inf_nan=False)]
+Latency = Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)]
+FullLock = Annotated[float, Field(gt=0, le=30, allow_inf_nan=False)]
+JpegQuality = Annotated[int, Field(ge=1, le=100)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,6 +230,37 @@ class PictureRandomizationConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class CarPictureRanges:
+    """The pictures of `evaluation.real_car.picture`, with ranges."""
+
+    jpeg_quality: Range[JpegQuality]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CarTimingRanges:
+    """The latency of `evaluation.real_car.timing`, with a range; the control period stays the simulator's."""
+
+    latency_s: Range[Latency]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CarControlsRanges:
+    """The controls of `evaluation.real_car.controls`, with ranges."""
+
+    full_lock_deg: Range[FullLock]
+    throttle_curve: Range[Fraction]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CarRandomizationConfig:
+    """How far cars see and act as the physical car, drawn for each episode; a part that is null is the simulator's."""
+
+    picture: CarPictureRanges | None = None
+    timing: CarTimingRanges | None = None
+    controls: CarControlsRanges | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class RandomizationConfig:
     """Domain randomization: the lowest and highest value of each quantity; each episode of each car draws its own.
 
@@ -245,8 +279,11 @@ class RandomizationConfig:
     observation_noise: Range[Fraction]
     observation_dropout: Range[Fraction]
     pictures: PictureRandomizationConfig | None = None
+    real_car: CarRandomizationConfig | None = None
 
 
-QUANTITIES = tuple(field.name for field in fields(RandomizationConfig) if field.name != "pictures")
+_GROUPS = ("pictures", "real_car")
+"""Keys of `RandomizationConfig` that are no range; what they draw is not in the trace."""
+QUANTITIES = tuple(field.name for field in fields(RandomizationConfig) if field.name not in _GROUPS)
 OFF = {name: 1.0 if name.endswith("_scale") else 0.0 for name in QUANTITIES}
 """The value of each quantity that has no effect."""

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from .bounds import Natural, NonNegative, UpTo1000
+from .driving import FullLock, JpegQuality, Latency
 
 Trials = Annotated[int, Field(ge=1, le=4096)]
 Share = Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)]
@@ -27,7 +28,7 @@ class PenaltyConfig:
 class CarPictureConfig:
     """How the car turns its camera's 640x480 into what a model sees."""
 
-    jpeg_quality: Annotated[int, Field(ge=1, le=100)] | None
+    jpeg_quality: JpegQuality | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,14 +36,14 @@ class CarTimingConfig:
     """When the car sees and acts."""
 
     frames_per_s: Annotated[float, Field(ge=5, le=60, allow_inf_nan=False)]
-    latency_s: Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)]
+    latency_s: Latency
 
 
 @dataclass(frozen=True, kw_only=True)
 class CarControlsConfig:
     """What the car makes of actions, see `aws.models.car_controls`."""
 
-    full_lock_deg: Annotated[float, Field(gt=0, le=30, allow_inf_nan=False)]
+    full_lock_deg: FullLock
     full_throttle_mps: Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)] | None
 
 

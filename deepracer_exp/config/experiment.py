@@ -21,7 +21,7 @@ from .learning import (
 )
 from .race import ALONE, RaceConfig
 from .running import BudgetConfig, CheckpointsConfig, CollectorConfig, TrackingConfig
-from .stopping import StoppingConfig
+from .stopping import ReliableStopping, StoppingConfig
 from .track import TrackConfig, Tracks
 
 
@@ -81,6 +81,12 @@ class Experiment:
         algorithm = self.algorithm
         if isinstance(algorithm, SACConfig):
             self._check_sac()
+        stopping = self.stopping
+        if isinstance(stopping, ReliableStopping) and stopping.evaluations and self.checkpoints.every is None:
+            raise ValueError(
+                f"stopping.evaluations={stopping.evaluations}: this training has no evaluations; accepted: null, or a "
+                "number of iterations for checkpoints.every"
+            )
         imitates = isinstance(algorithm, PPOConfig) and algorithm.teacher_iterations > 0
         if self.teacher is None and imitates:
             raise ValueError("teacher: algorithm=distill needs one; accepted: teacher=RUN, a trained run")

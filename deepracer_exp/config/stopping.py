@@ -20,11 +20,12 @@ class NoStopping:
 
 @dataclass(frozen=True, kw_only=True)
 class ReliableStopping:
-    """Stop once the car drives reliably: a share of the last episodes completed the lap."""
+    """Stop once the car drives reliably: it completed a share of the last episodes, or of the last evaluated laps."""
 
     kind: Literal["reliable"]
     lap_share: Fraction
     episodes: Count
+    evaluations: Count | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,13 +1,13 @@
 """The pictures of an observation: what each car's camera sees now, and saw before."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.driving import CameraConfig
-from deepracer_exp.config.evaluation import CarPictureConfig
 from deepracer_exp.config.track import FloorConfig
 from deepracer_exp.sim.batch import CarState
 from deepracer_exp.sim.camera import take_pictures
@@ -17,12 +17,14 @@ from deepracer_exp.tracks.track import Track
 
 from .picture_randomization import PictureRandomization
 from .randomization import Ids
-from .real_car import FRAME_SCALE, car_pictures
+from .real_car import AS_SIMULATED, FRAME_SCALE, car_pictures
 
 GREY = np.array([0.299, 0.587, 0.114], np.float32)
 """Weights of red, green and blue in the service's grey (ITU-R BT.601; deepracer-simapp turns RGB into luminance)."""
 _WALL_Y_LIGHT = 0.3
 """Brightness of the walls along the x axis relative to the others, in recorded frames (`benchmarks.camera`)."""
+_FRAMES_AT_ONCE = 16
+"""Frames of the physical car's camera: of grey ones, 5 MB."""
 
 Pixels = NDArray[np.uint8]
 
@@ -40,22 +42,23 @@ class Pictures:
         car: CarConfig,
         tracks: Sequence[Track],
         varied: PictureRandomization | None,
-        of_car: CarPictureConfig | None = None,
+        jpeg_quality: NDArray[np.int64],
     ) -> None:
         """Build the scenery.
 
-        `varied` differs from episode to episode and is drawn before the pictures are taken. `of_car` makes pictures as
-        the physical car does; without it each pixel is the mean of what it sees.
+        `varied` differs from episode to episode and is drawn before the pictures are taken. `jpeg_quality` of each car,
+        (N,), makes pictures as the physical car does; `AS_SIMULATED` leaves each pixel the mean of what it sees. Later
+        values count.
         """
-        self._of_car, finer = of_car, 1 if of_car is None else FRAME_SCALE
+        self._jpeg_quality = jpeg_quality
         self._varied = varied
         self.shape = config.shape
         self._now = config.shape[0] // config.frames  # channels of one moment
         sides_m = (0.5 * config.stereo_m, -0.5 * config.stereo_m) if config.stereo_m else (0.0,)
         self._lenses = [
             Lens(
-                width=finer * config.width,
-                height=finer * config.height,
+                width=config.width,
+                height=config.height,
                 field_of_view_rad=np.radians(config.field_of_view_deg),
                 x_m=car.camera_x_m,
                 y_m=side_m,
@@ -137,14 +140,40 @@ class Pictures:
             colors = (colors @ GREY)[..., None]
             if boxes is not None:
                 boxes = np.concatenate([boxes[..., :6], (boxes[..., 6:] @ GREY)[..., None]], axis=-1)
-        shots = []
-        for lens in self._lenses:
-            out = np.empty((len(ids), colors.shape[-1], lens.height, lens.width), np.uint8)
-            mounts = None if varied is None else varied.mounts(ids, lens.mount)
-            shot = take_pictures(lens, self._scenery, poses, course, colors, out, mounts, boxes)
-            shots.append(shot if self._of_car is None else car_pictures(shot, self._of_car.jpeg_quality))
+        shots = [self._shoot(lens, ids, poses, course, colors, boxes) for lens in self._lenses]
         now = shots[0] if len(shots) == 1 else np.concatenate(shots, axis=1)
         return now if varied is None else varied.disturb(ids, now, steps)
+
+    def _shoot(
+        self,
+        lens: Lens,
+        ids: Ids,
+        poses: NDArray[np.float64],
+        course: NDArray[np.intp],
+        colors: NDArray[np.float32],
+        boxes: NDArray[np.float32] | None,
+    ) -> Pixels:
+        """Return what cars see through a lens, (n, channels, height, width): arguments as for `take_pictures`."""
+        size = (colors.shape[-1], lens.height, lens.width)
+        is_real = self._jpeg_quality[ids] != AS_SIMULATED
+        if not is_real.any():
+            mounts = None if self._varied is None else self._varied.mounts(ids, lens.mount)
+            out = np.empty((len(ids), *size), np.uint8)
+            return take_pictures(lens, self._scenery, poses, course, colors, out, mounts, boxes)
+        if is_real.all() and len(ids) <= _FRAMES_AT_ONCE:
+            channels, height, width = size
+            frames = np.empty((len(ids), channels, FRAME_SCALE * height, FRAME_SCALE * width), np.uint8)
+            finer = replace(lens, height=frames.shape[-2], width=frames.shape[-1])
+            mounts = None if self._varied is None else self._varied.mounts(ids, finer.mount)
+            take_pictures(finer, self._scenery, poses, course, colors, frames, mounts, boxes)
+            return car_pictures(frames, self._jpeg_quality[ids])
+        out = np.empty((len(ids), *size), np.uint8)
+        real = np.flatnonzero(is_real)
+        some = [real[first : first + _FRAMES_AT_ONCE] for first in range(0, len(real), _FRAMES_AT_ONCE)]
+        for rows in (np.flatnonzero(~is_real), *some):
+            around = None if boxes is None else boxes[rows]
+            out[rows] = self._shoot(lens, ids[rows], poses[rows], course[rows], colors[rows], around)
+        return out
 
 
 def floor_colors(floor: FloorConfig) -> NDArray[np.float32]:

@@ -21,6 +21,7 @@ from .picture_randomization import PictureRandomization
 from .pictures import Pictures
 from .randomization import Randomization
 from .real_car import Servos
+from .real_car_randomization import RealCarRandomization
 from .rival import RaceRival
 from .rules import RaceRules, StepResult
 from .setup import RaceSetup
@@ -102,12 +103,17 @@ class Race:
         self._features = Features(
             setup.observation, self.rules.tracks, steering_max_deg, high[1], setup.observation_parts
         )
+        of_car, numbers = [randomization.real_car for randomization in randomizations], self.cars.tolist()
+        fixed = setup.real_car
+        real_car = RealCarRandomization(of_car, numbers, self._batch, fixed, setup.late_steps)
+        self._real_car = real_car
         self.randomization = Randomization(
             randomizations,
-            self.cars.tolist(),
+            numbers,
             self._batch,
             self._features.names,
-            setup.late_steps,
+            real_car.late_steps,
+            real_car.most_late_steps,
         )
         self._sees_others = setup.observation.next_objects > 0
         self._everyone = np.arange(n_cars)
@@ -116,28 +122,29 @@ class Race:
         self._commanded_mps = np.zeros(n_cars)
         self.observation = np.zeros((n_cars, len(self._features.names)), np.float32)
         camera, tracks = setup.observation.camera, [course.tracks[0] for course in setup.courses]
-        real_car = setup.real_car
         pictures = [randomization.pictures for randomization in randomizations]
         lidar = setup.observation.lidar
         others = 0 if setup.others is None else setup.others.others
         seen = camera is not None or lidar is not None
         self._varied = (
-            PictureRandomization(pictures, self.cars.tolist(), tracks, others)
+            PictureRandomization(pictures, numbers, tracks, others)
             if seen and any(config is not None for config in pictures)
             else None
         )
-        of_car = None if real_car is None else real_car.picture
-        self._pictures = None if camera is None else Pictures(camera, setup.car, tracks, self._varied, of_car)
-        self._servos = (
+        self._pictures = (
             None
-            if real_car is None or real_car.controls is None
-            else Servos(real_car.controls, setup.actions, n_cars)
+            if camera is None
+            else Pictures(camera, setup.car, tracks, self._varied, real_car.jpeg_quality)
+        )
+        top_mps = None if fixed is None or fixed.controls is None else fixed.controls.full_throttle_mps
+        self._servos = (
+            Servos(setup.actions, real_car.full_lock_deg, real_car.throttle_curve, top_mps)
+            if real_car.full_lock_deg.any()
+            else None
         )
         self.pixels = np.zeros((n_cars, *(camera.shape if camera is not None else (0,))), np.uint8)
         boxes = 0 if self._varied is None else self._varied.most_boxes
-        self._lidar = (
-            None if lidar is None else Lidar(lidar, tracks, self.cars.tolist(), self._period_s, boxes, others)
-        )
+        self._lidar = None if lidar is None else Lidar(lidar, tracks, numbers, self._period_s, boxes, others)
         self.lidar = np.zeros((n_cars, lidar.size if lidar is not None else 0), np.float32)
         self._kept = _KEPT if lidar is None else (*_KEPT, "lidar")
         self.reward = np.zeros(n_cars)
@@ -168,6 +175,7 @@ class Race:
     def seed(self, seed: int) -> None:
         """Start over: random streams from `seed`, start positions and clocks from the first episode."""
         self.randomization.seed(seed)
+        self._real_car.seed(seed)
         if self._varied is not None:
             self._varied.seed(seed)
         if self._lidar is not None:
@@ -210,11 +218,12 @@ class Race:
     def _begin(self, ids: np.ndarray) -> None:
         """Draw what differs from episode to episode."""
         self.randomization.begin(ids, self.rules.episode[ids])
-        self._begin_sight(ids)
+        self._draw_again(ids)
 
-    def _begin_sight(self, ids: np.ndarray) -> None:
-        """Draw what cameras and LIDARs see differently from episode to episode."""
+    def _draw_again(self, ids: np.ndarray) -> None:
+        """Draw what the episode's number decides: how far cars are the physical one, what cameras and LIDARs see."""
         episode = self.rules.episode[ids]
+        self._real_car.begin(ids, episode)
         if self._varied is not None:
             self._varied.begin(ids, episode, self.rules.course[ids])
         if self._lidar is not None:
@@ -325,6 +334,7 @@ class Race:
             "referee": self.rules.state_dict(),
             "randomization": self.randomization.state_dict(),
             **({} if self.others is None else {"others": self.others.state_dict()}),
+            **({} if self._servos is None else {"servos": self._servos.steering.copy()}),
             **{name.lstrip("_"): getattr(self, name).copy() for name in self._kept},
         }
 
@@ -347,13 +357,15 @@ class Race:
             setattr(self, name, checked_array(state, name.lstrip("_"), getattr(self, name).shape))
         self.rules.load_state_dict(state["referee"])
         self.randomization.load_state_dict(state["randomization"])
-        for sight in (self._varied, self._lidar):
-            if sight is not None:
-                sight.seed(state["randomization"]["seed"])
+        for draws in (self._real_car, self._varied, self._lidar):
+            if draws is not None:
+                draws.seed(state["randomization"]["seed"])
         if self.others is not None:
             self.others.seed(state["randomization"]["seed"])
             self.others.load_state_dict(state["others"])
-        self._begin_sight(self._everyone)
+        if self._servos is not None:
+            self._servos.steering = checked_array(state, "servos", self._servos.steering.shape)
+        self._draw_again(self._everyone)
         self._batch.set_floor_friction(self._everyone, self._floors[self.rules.course])
         # Last: setting a car's mass overwrites parts of the physics state.
         self._batch.state = physics

@@ -40,6 +40,7 @@ class Purpose(IntEnum):
     OTHERS = 7
     RIVALS = 8
     LOOKS = 9
+    REAL_CAR = 10
 
 
 class CarStreams:
@@ -119,12 +120,14 @@ class Randomization:
         cars: Sequence[int],
         batch: CarBatch,
         features: Sequence[str],
-        late_steps: tuple[int, int] = (0, 0),
+        late_steps: NDArray[np.int64],
+        most_late_steps: int,
     ):
         """Apply what is constant over all episodes; call `seed` and then `begin` next.
 
         Each car has its own ranges and its number over all processes; `features` names the observation's entries.
-        Steering and speed commands reach all cars `late_steps` control steps later than the drawn delay.
+        Steering and speed commands reach the cars `late_steps` control steps later than the drawn delay, (2, N), at
+        most `most_late_steps`. Later values of the array count.
         """
         ranges = np.array([[getattr(config, name) for name in QUANTITIES] for config in configs], np.float64)
         self._cars = list(cars)
@@ -152,7 +155,7 @@ class Randomization:
         self._measured = np.array([name not in _KNOWN for name in features], np.float64)
         self._first_noise: Floats = np.zeros((len(self._cars), len(features)))
         self._late_steps = late_steps
-        slots = int(ranges[:, _COLUMN["action_delay_steps"], 1].max()) + max(late_steps) + 1
+        slots = int(ranges[:, _COLUMN["action_delay_steps"], 1].max()) + most_late_steps + 1
         self._commands: Floats = np.zeros((slots, len(self._cars), 2))
         self._no_command_until = np.ones(len(self._cars), np.int64)
 
@@ -224,7 +227,7 @@ class Randomization:
         slots = len(self._commands)
         if slots > 1:
             sent = steps - self._of("action_delay_steps").astype(np.int64)
-            steering_at, speed_at = (sent - late for late in self._late_steps)
+            steering_at, speed_at = sent - self._late_steps
             self._commands[steps % slots, self._rows] = np.stack([steering_deg, speed_mps], axis=1)
             steering_deg = self._commands[steering_at % slots, self._rows, 0]
             # Earlier commands are void, and the speed may arrive before the steering.

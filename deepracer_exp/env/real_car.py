@@ -6,11 +6,17 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from deepracer_exp.aws.models.car_controls import full_scale, servo_value, steering_share, throttle
-from deepracer_exp.config.evaluation import CarControlsConfig, RealCarConfig
+from deepracer_exp.aws.models.car_controls import (
+    full_scale,
+    servo_value,
+    speed_share,
+    steering_share,
+    throttle,
+)
+from deepracer_exp.config.evaluation import RealCarConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.errors import BadInput
 
@@ -23,6 +29,10 @@ CAR_PICTURE = (160, 120)
 """Width and height of what the car's software shows a model."""
 FRAME_SCALE = 4
 """Width and height of the camera's frames over those of the picture."""
+AS_SIMULATED, UNCOMPRESSED = -1, 0
+"""In place of a JPEG quality: pictures of the simulator, and pictures of the car without compression."""
+
+Floats = NDArray[np.float64]
 
 
 def car_refusals(experiment: Experiment) -> list[str]:
@@ -72,14 +82,14 @@ def car_refusals(experiment: Experiment) -> list[str]:
     return refusals
 
 
-def require_car(experiment: Experiment) -> None:
-    """Refuse a policy that the car could not run, with the first of `car_refusals`.
+def require_car(experiment: Experiment, key: str = "evaluation.real_car") -> None:
+    """Refuse a policy that the car could not run, with the first of `car_refusals`; `key` asked for the car.
 
     Raises:
         BadInput: it could not.
     """
     for refusal in car_refusals(experiment):
-        raise BadInput("evaluation.real_car", f"the car cannot run this policy: {refusal}")
+        raise BadInput(key, f"the car cannot run this policy: {refusal}")
 
 
 def as_the_car(setup: "RaceSetup", real_car: RealCarConfig) -> "RaceSetup":
@@ -92,17 +102,16 @@ def as_the_car(setup: "RaceSetup", real_car: RealCarConfig) -> "RaceSetup":
         return setup
     car, episode, frames_per_s = setup.car, setup.episode, real_car.timing.frames_per_s
     ratio = frames_per_s / car.control_hz
-    # The car's own delays are shares of a control period, so whole periods are left to the queue of commands.
-    own_s = (car.steering_delay_s, car.speed_delay_s)
-    whole, rest = zip(*(divmod(s + real_car.timing.latency_s, 1 / frames_per_s) for s in own_s), strict=True)
+    own_s = np.array([car.steering_delay_s, car.speed_delay_s])
+    whole, rest = split_delay(own_s + real_car.timing.latency_s, 1 / frames_per_s)
     return replace(
         setup,
         car=replace(
             car,
             control_hz=frames_per_s,
             substeps=max(1, math.ceil(car.substeps / ratio)),
-            steering_delay_s=rest[0],
-            speed_delay_s=rest[1],
+            steering_delay_s=float(rest[0]),
+            speed_delay_s=float(rest[1]),
         ),
         late_steps=(int(whole[0]), int(whole[1])),
         episode=replace(
@@ -115,32 +124,58 @@ def as_the_car(setup: "RaceSetup", real_car: RealCarConfig) -> "RaceSetup":
     )
 
 
+def split_delay(delay_s: Floats, period_s: float) -> tuple[NDArray[np.int64], Floats]:
+    """Return delays as whole control periods, which the queue of commands takes, and the seconds left for the car."""
+    whole, rest_s = np.divmod(delay_s, period_s)
+    return whole.astype(np.int64), rest_s
+
+
 class Servos:
     """Steering servo and motor of N cars: what they make of commands.
 
     The speed is taken to be proportional to the throttle; nothing is published on how the car's motor answers it.
     """
 
-    def __init__(self, config: CarControlsConfig, actions: ActionSpace, n_cars: int) -> None:
-        """Start centred."""
+    def __init__(
+        self,
+        actions: ActionSpace,
+        full_lock_deg: Floats,
+        throttle_curve: Floats,
+        full_throttle_mps: float | None = None,
+    ) -> None:
+        """Start centred.
+
+        Args:
+            actions: their largest angle is full lock, their fastest speed full throttle.
+            full_lock_deg: of each car, (N,); 0: its commands are followed as they are. Later values count.
+            throttle_curve: share of the car's throttle curve in that of each car, whose rest is proportional to the
+                speed, (N,). Later values count.
+            full_throttle_mps: speed at full throttle; None: that of the fastest action.
+        """
         self._scale = full_scale(metadata_of(actions))
-        self._full_lock_deg = config.full_lock_deg
-        self._full_throttle_mps = config.full_throttle_mps or self._scale.speed_mps
-        self._steering = np.zeros(n_cars)
+        self._full_lock_deg, self._throttle_curve = full_lock_deg, throttle_curve
+        self._full_throttle_mps = full_throttle_mps or self._scale.speed_mps
+        self.steering = np.zeros(len(full_lock_deg))
+        """Angles as shares of full lock, (N,)."""
 
     def center(self, ids: NDArray[np.intp]) -> None:
         """Centre the steering of the cars `ids`."""
-        self._steering[ids] = 0.0
+        self.steering[ids] = 0.0
 
-    def follow(self, steering_deg: NDArray[np.float64], speed_mps: NDArray[np.float64]) -> Commands:
+    def follow(self, steering_deg: Floats, speed_mps: Floats) -> Commands:
         """Return the angles and speeds that commands lead to, each (N,)."""
         requested = steering_share(steering_deg, self._scale.steering_deg)
-        self._steering = servo_value(requested, self._steering)
-        speed_share = throttle(speed_mps, self._scale.speed_mps)
-        return self._full_lock_deg * self._steering, self._full_throttle_mps * speed_share
+        self.steering = servo_value(requested, self.steering)
+        curve, fastest_mps = self._throttle_curve, self._scale.speed_mps
+        share = curve * throttle(speed_mps, fastest_mps) + (1 - curve) * speed_share(speed_mps, fastest_mps)
+        is_servo = self._full_lock_deg > 0
+        return (
+            np.where(is_servo, self._full_lock_deg * self.steering, steering_deg),
+            np.where(is_servo, self._full_throttle_mps * share, speed_mps),
+        )
 
 
-def car_pictures(frames: NDArray[np.uint8], jpeg_quality: int | None) -> NDArray[np.uint8]:
+def car_pictures(frames: NDArray[np.uint8], jpeg_quality: ArrayLike) -> NDArray[np.uint8]:
     """Return the pictures that the car makes of its camera's frames for a model, (n, channels, height, width).
 
     The car compresses in colour and turns grey last; here it is the other way round: JPEG stores brightness separately,
@@ -148,15 +183,15 @@ def car_pictures(frames: NDArray[np.uint8], jpeg_quality: int | None) -> NDArray
 
     Args:
         frames: grey, (n, channels, FRAME_SCALE * height, FRAME_SCALE * width).
-        jpeg_quality: None: not compressed.
+        jpeg_quality: 1 to 100, or `UNCOMPRESSED`, for all or (n,).
     """
     # cv::resize, bilinear: between pixels 1 and 2 of each 4 by 4; the others are not used.
     rows = frames[..., 1::FRAME_SCALE, :].astype(np.uint16) + frames[..., 2::FRAME_SCALE, :]
     small = ((rows[..., 1::FRAME_SCALE] + rows[..., 2::FRAME_SCALE] + 2) >> 2).astype(np.uint8)
-    if jpeg_quality is not None:
-        for picture in small.reshape(-1, *small.shape[-2:]):
+    for pictures, quality in zip(small, np.broadcast_to(jpeg_quality, len(small)).tolist(), strict=True):
+        for picture in pictures if quality != UNCOMPRESSED else ():
             file = io.BytesIO()
-            Image.fromarray(picture).save(file, "JPEG", quality=jpeg_quality)
+            Image.fromarray(picture).save(file, "JPEG", quality=quality)
             picture[:] = np.asarray(Image.open(file))
     return small
 

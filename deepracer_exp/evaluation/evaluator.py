@@ -86,6 +86,9 @@ class Evaluator:
         conditions = {USUAL: _conditions("usual", config.usual, experiment)}
         if config.held_out is not None:
             conditions[HELD_OUT] = _conditions("held_out", config.held_out, experiment)
+        for condition, randomization in conditions.items():
+            if randomization.real_car is not None:
+                require_car(experiment, f"evaluation.{condition}")
         against_rival = race_of(experiment, config).rivals is not None
         self.trials = [
             EvaluationTrial(course=place, condition=condition, start_ndist=start)

@@ -176,6 +176,11 @@ class CarBatch:
         """Divide the time constant of cars' steering by scale, (n,), relative to the configured one."""
         self._cars["steering_time_s"][ids] = self._car["steering_time_s"] / scale
 
+    def set_delays(self, ids: Ids, steering_delay_s: Floats, speed_delay_s: Floats) -> None:
+        """Set the delays of cars' commands, (n,) each, below a control period, in place of the configured ones."""
+        self._cars["steering_delay"][ids] = steering_delay_s * self.car.control_hz
+        self._cars["speed_delay"][ids] = speed_delay_s * self.car.control_hz
+
 
 def _require_finite(what: str, finite: NDArray[np.bool_]) -> None:
     """Raise RunFailed for the first car, (N, k), of which a number is not finite."""

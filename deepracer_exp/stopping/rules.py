@@ -1,6 +1,7 @@
 """The rules by which a run stops: a `StoppingRule` decides after each row of metrics.jsonl."""
 
 import math
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -117,13 +118,18 @@ class StoppingRule:
 
 
 class ReliableRule(StoppingRule):
-    """Ends a run once a share of the last episodes completed the lap, on every track."""
+    """Ends a run once the policy completes a share of its laps: of the last episodes, or of the last evaluations."""
 
     def __init__(self, config: ReliableStopping):
         self._config = config
+        self._evaluated: deque[tuple[int, int]] = deque(maxlen=config.evaluations)
+        """Complete laps of the last evaluations on the usual conditions, and those tried."""
 
     def observe(self, row: Row) -> Decision | None:
         """Compare the share of complete laps."""
+        return self._explored(row) if self._config.evaluations is None else self._raced(row)
+
+    def _explored(self, row: Row) -> Decision | None:
         share = row["lap_share"]
         if share is None or share < self._config.lap_share:
             return None
@@ -131,6 +137,17 @@ class ReliableRule(StoppingRule):
         more, where = (" or more", f" on each of {tracks} tracks") if tracks else ("", "")
         why = f"{share:.0%}{more} of the last {self._config.episodes} episodes completed the lap{where}"
         return _decision("reliable", why, {"lap_share": share}, self._config)
+
+    def _raced(self, row: Row) -> Decision | None:
+        config, tried = self._config, row.get("eval_laps_tried")
+        if not tried:
+            return None
+        self._evaluated.append((row["eval_laps"], tried))
+        laps, tried = (sum(column) for column in zip(*self._evaluated, strict=True))
+        if len(self._evaluated) != config.evaluations or laps < config.lap_share * tried:
+            return None
+        why = f"{laps} of {tried} laps of the last {count(len(self._evaluated), 'evaluation')} were complete"
+        return _decision("reliable", why, {"lap_share": laps / tried}, config)
 
 
 class TrendRule(StoppingRule):

@@ -47,6 +47,8 @@ def plan_training(
     teacher = rival = None
     if experiment.evaluation.real_car is not None:
         require_car(experiment)
+    if experiment.randomization.real_car is not None:
+        require_car(experiment, "randomization.real_car")
     runs_dir, uri = Path(experiment.runs_dir), getattr(experiment.tracking, "uri", None)
     if experiment.teacher is not None:
         teacher = resolve(experiment.teacher, runs_dir, uri).with_policy()

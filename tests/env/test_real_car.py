@@ -18,7 +18,7 @@ from deepracer_exp.config.evaluation import (
 )
 from deepracer_exp.env.action_space import ContinuousActions, DiscreteActions
 from deepracer_exp.env.race import Race
-from deepracer_exp.env.real_car import Servos, as_the_car, car_pictures, car_refusals
+from deepracer_exp.env.real_car import UNCOMPRESSED, Servos, as_the_car, car_pictures, car_refusals
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.env.trace import PACKED
 
@@ -99,7 +99,7 @@ def test_a_picture_is_the_mean_of_the_middle_two_by_two_of_each_four_by_four_pix
     frame[1:3, 1:3] = [[10, 20], [30, 43]]
     frame[:, 4:] = 255
     frame[1:3, 5:7] = 7
-    np.testing.assert_array_equal(car_pictures(frame[None, None], None), [[[[26, 7]]]])
+    np.testing.assert_array_equal(car_pictures(frame[None, None], UNCOMPRESSED), [[[[26, 7]]]])
 
 
 def test_compressing_grey_is_as_good_as_compressing_colour_and_turning_it_grey(setup):
@@ -114,7 +114,7 @@ def test_compressing_grey_is_as_good_as_compressing_colour_and_turning_it_grey(s
     # OpenCV's default of chroma: half the resolution.
     Image.fromarray(np.moveaxis(rgb, 0, -1)).save(file, "JPEG", quality=95, subsampling="4:2:0")
     decoded = np.asarray(Image.open(file), np.float64) @ np.array([0.299, 0.587, 0.114])
-    ours = car_pictures(np.kron(grey[None], np.ones((1, 4, 4), np.uint8))[None], 95)[0, 0]
+    ours = car_pictures(np.kron(grey[None], np.ones((1, 4, 4), np.uint8)), 95)[0, 0]
     difference = np.abs(decoded - ours)
     assert difference.mean() < 0.5
     assert np.quantile(difference, 0.999) < 4
@@ -167,17 +167,18 @@ def test_a_latency_of_half_a_frame_delays_the_drive_by_half_a_frame(blind, turns
 
 def test_the_largest_angle_becomes_full_lock_and_half_the_speed_four_fifths():
     actions = DiscreteActions(np.array([-20.0, 0.0, 10.0]), np.array([1.0, 2.0, 1.0]))
-    servos = Servos(WHOLE.controls, actions, 3)
+    lock_deg, curve = np.full(3, 30.0), np.ones(3)
+    servos = Servos(actions, lock_deg, curve)
     steering_deg, speed_mps = servos.follow(*actions.commands(np.array([0, 1, 2])))
     np.testing.assert_allclose(steering_deg, [-30.0, 0.0, 15.0])
     np.testing.assert_allclose(speed_mps, [1.6, 2.0, 1.6])
-    faster = Servos(replace(WHOLE.controls, full_throttle_mps=4.0), actions, 3)
+    faster = Servos(actions, lock_deg, curve, full_throttle_mps=4.0)
     np.testing.assert_allclose(faster.follow(*actions.commands(np.array([0, 1, 2])))[1], [3.2, 4.0, 3.2])
 
 
 def test_steering_that_the_servo_refuses_leaves_the_last_until_the_car_is_put_back():
     actions = ContinuousActions(np.array([-27.0, 1.0]), np.array([25.0, 3.0]))
-    servos = Servos(WHOLE.controls, actions, 2)
+    servos = Servos(actions, np.full(2, 30.0), np.ones(2))
     steered = [
         servos.follow(np.array([degrees, 5.0]), np.ones(2))[0][0] for degrees in (12.5, -26.0, -25.0, -27.0)
     ]

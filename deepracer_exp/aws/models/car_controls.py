@@ -36,13 +36,18 @@ def steering_share(steering_deg: ArrayLike, full_lock_deg: float) -> Floats:
     return steering_deg / full_lock_deg if full_lock_deg > 0 else np.zeros_like(steering_deg)
 
 
+def speed_share(speed_mps: ArrayLike, full_throttle_mps: float) -> Floats:
+    """Return speed as a share of that at full throttle; with a `full_throttle_mps` of 0, of `full_scale`, 0."""
+    speed_mps = np.asarray(speed_mps, np.float64)
+    return speed_mps / full_throttle_mps if full_throttle_mps > 0 else np.zeros_like(speed_mps)
+
+
 def throttle(speed_mps: ArrayLike, full_throttle_mps: float) -> Floats:
     """Return the throttle, 0 to 1: a parabola through 0, `HALF_SPEED_THROTTLE` at half speed and 1 at full speed.
 
     With a `full_throttle_mps` of 0, of `full_scale`, the car stands.
     """
-    speed_mps = np.asarray(speed_mps, np.float64)
-    share = speed_mps / full_throttle_mps if full_throttle_mps > 0 else np.zeros_like(speed_mps)
+    share = speed_share(speed_mps, full_throttle_mps)
     a, b = 2.0 - 4.0 * HALF_SPEED_THROTTLE, 4.0 * HALF_SPEED_THROTTLE - 1.0
     curve: Floats = np.clip((a * share + b) * share, -1.0, 1.0)
     return curve
