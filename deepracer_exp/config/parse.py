@@ -1,6 +1,7 @@
 """Plain values to validated, frozen dataclasses; bad values are reported by their dotted keys."""
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from functools import cache
@@ -91,12 +92,7 @@ def _check_combinations(experiment: Experiment) -> None:
             f"reward.time_limit_s={limit_s:g} is not below collector.hang_timeout_s={hang_s:g}",
             "a worker waiting for its reward function would count as hanging",
         )
-    delay, still = experiment.randomization.action_delay_steps[1], experiment.episode.immobilized_steps
-    if still and delay + 1 >= still:
-        raise BadInput(
-            f"randomization.action_delay_steps reaches {delay} with episode.immobilized_steps={still}: a car "
-            f"with so long a delay counts as immobilized before it moves; accepted: up to {max(0, still - 2)}"
-        )
+    _check_delay(experiment)
     for name, track in experiment.tracks.items():
         key = f"track.{name}" if isinstance(experiment.track, dict) else "track"
         _check_shape(key, track)
@@ -104,6 +100,20 @@ def _check_combinations(experiment: Experiment) -> None:
         raise BadInput(
             f"collector.cars={collector.cars} with {len(experiment.tracks)} tracks: every track needs a car; accepted: "
             f"at least {len(experiment.tracks)}"
+        )
+
+
+def _check_delay(experiment: Experiment) -> None:
+    """Refuse delays after which a car counts as immobilized before it moves."""
+    drawn, still = experiment.randomization, experiment.episode.immobilized_steps
+    delay, key = drawn.action_delay_steps[1], "action_delay_steps"
+    if drawn.real_car is not None and drawn.real_car.timing is not None:
+        late = math.floor(drawn.real_car.timing.latency_s[1] * experiment.car.control_hz)
+        delay, key = delay + late, f"{key} with real_car.timing.latency_s" if late else key
+    if still and delay + 1 >= still:
+        raise BadInput(
+            f"randomization.{key} reaches {delay} with episode.immobilized_steps={still}: a car with so long a delay "
+            f"counts as immobilized before it moves; accepted: up to {max(0, still - 2)}"
         )
 
 

@@ -71,12 +71,9 @@ class RealCarRandomization:
         if not self._draws:
             return
         # All are drawn, so that a part that is left out does not change the others.
-        uniform = np.array(
-            [
-                self._streams.stream(car, episode).random(len(_OFF))
-                for car, episode in zip(ids.tolist(), episodes.tolist(), strict=True)
-            ]
-        )
+        uniform = np.empty((len(ids), len(_OFF)))
+        for row, car, episode in zip(uniform, ids.tolist(), episodes.tolist(), strict=True):
+            self._streams.stream(car, episode).random(out=row)
         drawn = self._low[ids] + self._span[ids] * uniform
         self.jpeg_quality[ids] = np.floor(drawn[:, _QUALITY])
         self.full_lock_deg[ids] = drawn[:, _LOCK]

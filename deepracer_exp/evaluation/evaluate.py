@@ -39,12 +39,6 @@ _MINOR = ("median", "std", "score s", "zig-zag /m")
 SIMULATOR, CAR = "simulator", "car"
 """Names of what is compared, beside the parts of `RealCarConfig`."""
 _PARTS = tuple(field.name for field in fields(RealCarConfig))
-CURES = {
-    "picture": "pictures (blur, pixel_noise)",
-    "timing": "action_delay_steps, observation_dropout",
-    "controls": "speed_noise, motor_scale, servo_scale, in part",
-}
-"""The parts of `randomization=sim2real` that prepare a policy for each part of the real car."""
 
 
 def results_table(
@@ -351,10 +345,16 @@ def car_table(evaluations: Mapping[str, Evaluation]) -> Table:
     """Return what is lost under usual conditions as a table: simulator, each part of the car alone, all of them."""
     figures = car_figures(evaluations)
     base = figures[SIMULATOR]
-    shown = Table(box=None, pad_edge=False, title="from the simulator to the car", title_justify="left")
+    shown = Table(
+        box=None,
+        pad_edge=False,
+        title="from the simulator to the car",
+        title_justify="left",
+        caption="randomization=real_car has these parts in the training",
+        caption_justify="left",
+    )
     for name in ("as on the car", "laps %", "lost %", "done %", "lap s", "lost s"):
         shown.add_column(name, justify="left" if name == "as on the car" else "right", no_wrap=True)
-    shown.add_column("in sim2real against it")
     names = {SIMULATOR: "nothing", CAR: "all"}
     for name, figure in figures.items():
         lap_s, base_s = figure["lap_time_s"], base["lap_time_s"]
@@ -366,7 +366,6 @@ def car_table(evaluations: Mapping[str, Evaluation]) -> Table:
             f"{100 * figure['completion']:.1f}",
             number(lap_s, 2),
             NOTHING if lost_s is None else f"{lost_s:+.2f}",
-            CURES.get(name, ""),
         )
     return shown
 

@@ -54,3 +54,10 @@ def test_parts_that_are_off_are_not_driven(config):
 def test_a_policy_of_features_is_refused(config):
     with pytest.raises(BadInput, match="the car has no features"):
         Evaluator(compose_experiment([])[0], config)
+
+
+@pytest.mark.parametrize("condition", ["usual", "held_out"])
+def test_conditions_of_the_car_are_refused_for_a_policy_of_features(condition):
+    lines = ["evaluation=three_trials", f"evaluation.{condition}=real_car"]
+    with pytest.raises(BadInput, match=rf"evaluation\.{condition}: the car cannot run .* no features"):
+        Evaluator(compose_experiment([])[0], compose_evaluation(lines)[0].evaluation)

@@ -8,6 +8,7 @@ import pytest
 
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.stopping import StoppingConfig
+from deepracer_exp.errors import BadInput
 from deepracer_exp.stopping.rules import Decision, build_rule, entropy_share
 
 ACTIONS = 15
@@ -269,6 +270,24 @@ def test_a_policy_far_below_the_entropy_it_is_led_to_has_collapsed(actions):
 def test_a_fixed_temperature_has_no_target_and_is_judged_as_any_policy():
     rows = history(**RANDOM)
     assert stopped_at([row | {"target_entropy": None} for row in rows], rule()) == stopped_at(rows, rule())
+
+
+def test_reliable_counts_the_laps_of_the_last_evaluations():
+    def row(laps: int | None) -> dict:
+        # The training's own laps do not count.
+        return {"lap_share": 1.0, "eval_laps": laps, "eval_laps_tried": None if laps is None else 10}
+
+    of_three = rule("stopping.lap_share=0.9", "stopping.evaluations=3", option="reliable")
+    laps = [10, 10, None, 6, None, 10, 10, None, 7, 10, 10]
+    number, decision = stopped_at(list(map(row, laps)), of_three)
+    assert number == len(laps)
+    assert str(decision) == "reliable: 27 of 30 laps of the last 3 evaluations were complete"
+    assert stopped_at(list(map(row, laps[:-1])), of_three) == (None, None)
+
+
+def test_reliable_of_evaluations_that_are_never_made_is_refused():
+    with pytest.raises(BadInput, match=r"stopping\.evaluations=4: this training has no evaluations"):
+        rule("checkpoints.every=null", option="reliable_laps")
 
 
 def test_reliable_looks_at_the_share_of_laps():

@@ -36,6 +36,7 @@ def load(cwd, name):
         ((LR, "sweep.pruners=[median]", "sweep.objectives=[lap_time,completion]"), ("median", "several")),
         ((LR, "sweep.protocol=real_car"), ("real_car", "the car has no features of the road")),
         (("observation=camera,camera_small", "sweep.protocol=real_car"), ("observation=camera", "160x120")),
+        ((LR, "randomization=real_car"), ("randomization.real_car", "the car has no features of the road")),
         ((LR, "seed=0,1"), ("sweep.seeds",)),
         ((LR, "parent=no_such_run"), ("parent=no_such_run",)),
         ((LR, "--storage", "sqlite:///x.db"), ("unrecognized arguments: --storage",)),

@@ -208,6 +208,8 @@ class _Trials:
         build_action_space(experiment.action_space)
         if self._on_the_car:
             require_car(experiment)
+        if experiment.randomization.real_car is not None:
+            require_car(experiment, "randomization.real_car")
 
     def _with(self, group: str, option: Choice) -> Mapping[str, Any]:
         return self._values({group: as_override(group, option)})
