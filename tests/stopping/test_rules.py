@@ -278,7 +278,7 @@ def test_reliable_counts_the_laps_of_the_last_evaluations():
         return {"lap_share": 1.0, "eval_laps": laps, "eval_laps_tried": None if laps is None else 10}
 
     of_three = rule("stopping.lap_share=0.9", "stopping.evaluations=3", option="reliable")
-    laps = [10, 10, None, 6, None, 10, 10, None, 7, 10, 10]
+    laps = [10, 10, None, 6, None, 10, 10, None, 7]
     number, decision = stopped_at(list(map(row, laps)), of_three)
     assert number == len(laps)
     assert str(decision) == "reliable: 27 of 30 laps of the last 3 evaluations were complete"
