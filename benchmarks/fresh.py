@@ -46,11 +46,11 @@ def protocol(*overrides: str) -> EvaluationConfig:
     return compose_evaluation(overrides)[0].evaluation
 
 
-def fresh_trials(trials: int) -> EvaluationConfig:
-    """Return trials of one lap each whose starts and conditions no training's evaluation has."""
+def fresh_trials(trials: int, option: str = "three_trials") -> EvaluationConfig:
+    """Return an option of conf/evaluation with single laps whose starts and conditions no training's evaluation has."""
     starts = ",".join(repr((place + _SHIFT) / trials) for place in range(trials))
     conditions = (f"evaluation.seed={_SEED}", f"evaluation.starts=[{starts}]")
-    return protocol("evaluation=three_trials", f"evaluation.trials={trials}", *conditions)
+    return protocol(f"evaluation={option}", f"evaluation.trials={trials}", *conditions)
 
 
 def stored_policy(run: Path, checkpoint: str | None = None) -> tuple[Experiment, nn.Module]:

@@ -1,114 +1,193 @@
-"""What does a camera policy lose between the simulator and the physical car, trained with and without `sim2real`?
+"""What `experiment=real_car` drives in the simulator and as the physical car, and what its ingredients bring.
 
-    python -m benchmarks.real_car [--seeds 5] [--folder FOLDER] [--json FILE] [OVERRIDE...]
+    python -m benchmarks.real_car [--seeds 5] [--tracks A,B] [--without smoothness,...] [--jobs 1]
+                                  [--runs-dir DIR] [--json FILE] [OVERRIDE...]
 
-For each seed a policy that sees features is trained for TEACHER_STEPS with `randomization=sim2real`. From it two
-policies learn that see what the car sees (`observation=camera`), ITERATIONS of `algorithm=distill` each, at a falling
-learning rate: one in the simulator as it is, one with `randomization=sim2real`. Their last policies then drive laps
-from STARTS starts spread evenly over the lap under `evaluation=real_car`: as in the simulator, with each of the car's
-differences from it alone, and with all of them.
+For each track and seed `deepracer-exp train experiment=real_car` trains as the experiment has it, and once more without
+each of the ingredients of `--without`: without `smoothness` of the policy's actions; without the `car`'s own picture,
+timing and controls in the training (`randomization=sim2real`); without its `speeds`, with those of the default action
+space; without `sim2real` and the car. OVERRIDE goes to all of them: `device=cuda collector=in_process` for a GPU.
 
-`lap_share` is the share of complete laps, `completion` the mean share of the lap that was driven, `lap_time_s` the mean
-of the complete laps. Intervals are those of the mean over seeds (95%, t); `gain` is with minus without, seed by seed.
+The best checkpoint of each then drives single laps from TRIALS starts by which none was chosen, the most probable
+actions: in the simulator, under `sim2real`, and as the physical car does (`evaluation=real_car`) with each of its parts
+alone and with all.
 
-FOLDER keeps runs and results, so that a second call continues the first; overrides are those of the two policies.
+JSON has in `trainings` a row for each track and ingredient left out (null: none). Its figures have a value for each
+seed, null where there is none, with the interquartile mean over seeds and its 95% bootstrap interval:
+
+- `steps`, `train_s`: of the whole training, its evaluations included;
+- `laps_simulator`, `laps_sim2real`, `laps_picture`, `laps_timing`, `laps_controls`, `laps_car`: share of complete laps;
+- `lap_s_simulator`, ...: mean time of these;
+- `zigzag_simulator`, `zigzag_car`: changes of steering from side to side a metre of straight.
+
+`--runs-dir DIR` leaves the runs in DIR and takes those that it finds finished there: an interrupted benchmark
+continues.
 """
 
-import json
-import time
-from collections.abc import Callable, Sequence
+import argparse
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from deepracer_exp.evaluation.evaluate import car_figures, race_car_parts
+import torch
+
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.evaluation import EvaluationConfig
+from deepracer_exp.errors import BadInput
+from deepracer_exp.evaluation.evaluate import CAR, SIMULATOR, car_protocols
 from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.evaluation.result import USUAL
 
-from .command import trained
-from .fresh import protocol, stored_policy
-from .report import benchmark_parser, interval_text, mean_and_interval, number, percent, table, write_json
+from .command import at_once, read_summary, trained
+from .fresh import fresh_trials, stored_policy
+from .report import (
+    benchmark_parser,
+    iqm_text,
+    number,
+    over_seeds,
+    percent,
+    table,
+    with_exit_code,
+    write_json,
+)
 
-TEACHER_STEPS, ITERATIONS, STARTS = 300_000, 40, 20
-WAYS: dict[str, list[str]] = {"without": [], "with": ["randomization=sim2real"]}
-FIGURES = ("lap_share", "completion", "lap_time_s")
-
-Figures = dict[str, dict[str, Any]]
-
-
-def drive(run: Path) -> Figures:
-    """Let a run's last policy drive as in the simulator and as on the car."""
-    experiment, policy = stored_policy(run, "last")
-    config = protocol("evaluation=real_car", f"evaluation.trials={STARTS}")
-    return car_figures(race_car_parts(experiment, config, policy, Evaluator(experiment, config)(policy)))
-
-
-def measure(folder: Path, seed: int, overrides: Sequence[str]) -> dict[str, Figures]:
-    """Train and drive with one seed whatever the folder does not have yet."""
-    folder.mkdir(parents=True, exist_ok=True)
-    every = ["stopping=none", "checkpoints.every=null", "tracking=off", "report=false", f"seed={seed}"]
-    driven = {}
-    for way, randomization in WAYS.items():
-        result = folder / f"{way}.json"
-        if not result.exists():
-            length = f"budget.env_steps={TEACHER_STEPS}"
-            teacher = trained(folder, ["name=teacher", *every, length, "randomization=sim2real"])
-            student = [
-                *(f"name={way}", f"teacher={teacher.resolve()}", "observation=camera", "lr_schedule=linear"),
-                *("algorithm=distill", f"algorithm.teacher_iterations={ITERATIONS}"),
-                *(f"budget.iterations={ITERATIONS}", "budget.env_steps=null"),
-            ]
-            run = trained(folder, [*student, *every, *randomization, *overrides])
-            began = time.monotonic()
-            result.write_text(json.dumps(drive(run), indent=2) + "\n", encoding="utf-8")
-            print(f"{folder.name}: {way} driven in {time.monotonic() - began:.0f} s", flush=True)
-        driven[way] = json.loads(result.read_text(encoding="utf-8"))
-    return driven
+TRACKS = ("reinvent_base", "reInvent2019_track")
+WITHOUT: dict[str, list[str]] = {
+    "smoothness": ["algorithm.smoothness=0.0"],
+    "car": ["randomization=sim2real"],
+    "speeds": ["action_space.speed.low=1.0", "action_space.speed.high=4.0"],
+    "sim2real": ["randomization=none"],
+}
+"""Overrides that leave an ingredient out."""
+SIM2REAL = "sim2real"
+WANTED = {SIMULATOR: 0.95, SIM2REAL: 0.9, CAR: 0.9}
+"""Shares of complete laps that are wanted within `WANTED_S` of training on two cores."""
+WANTED_S = 3600.0
+TRIALS = 20
+_ALWAYS = ("tracking=off", "report=false")
 
 
-def summarize(seeds: Sequence[dict[str, Figures]]) -> dict[str, Any]:
-    """Return mean and interval of each figure with, without, and of the gain, by what is as on the car."""
-    found: dict[str, Any] = {}
-    for name in seeds[0]["with"]:
-        found[name] = {}
-        for figure in FIGURES:
-            pairs = [{way: seed[way][name][figure] for way in WAYS} for seed in seeds]
-            gains = [None if None in pair.values() else pair["with"] - pair["without"] for pair in pairs]
-            found[name][figure] = {
-                **{way: mean_and_interval([pair[way] for pair in pairs]) for way in WAYS},
-                "gain": mean_and_interval(gains),
-            }
-    return found
+def training_overrides(track: str, without: str | None, overrides: Sequence[str]) -> list[str]:
+    """Return the overrides of `deepracer-exp train` of all seeds; `without` is a key of `WITHOUT`, or None."""
+    left_out = [] if without is None else WITHOUT[without]
+    return ["experiment=real_car", f"track={track}", *_ALWAYS, *left_out, *overrides]
 
 
+def protocols() -> dict[str, EvaluationConfig]:
+    """Return how a policy is driven, by name."""
+    config = fresh_trials(TRIALS, "real_car")
+    simulator, *parts = car_protocols(config).items()
+    under_sim2real = (SIM2REAL, replace(simulator[1], usual=SIM2REAL))
+    return dict([simulator, under_sim2real, *parts, (CAR, config)])
+
+
+def measure(run: Path) -> dict[str, float | None]:
+    """Return the figures of a run."""
+    torch.set_num_threads(1)
+    summary = read_summary(run)
+    experiment, policy = stored_policy(run)
+    figures: dict[str, float | None] = {"steps": summary["env_steps"], "train_s": summary["wall_clock_s"]}
+    for name, config in protocols().items():
+        driven = Evaluator(experiment, config)(policy).on(USUAL)
+        figures |= {f"laps_{name}": driven.lap_share, f"lap_s_{name}": driven.mean_lap_time_s}
+        if name in (SIMULATOR, CAR):
+            figures[f"zigzag_{name}"] = driven.zigzag.changes_per_m
+    return {name: None if value is None else round(value, 4) for name, value in figures.items()}
+
+
+def benchmark(options: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
+    """Train what is not in `folder` yet, drive, and return a row for each track and ingredient left out."""
+    asked = [
+        (track, without, training_overrides(track, without, options.overrides))
+        for track in options.tracks
+        for without in (None, *options.without)
+    ]
+    # All of them before the first training: one that cannot be composed costs nothing.
+    for _, _, words in asked:
+        compose_experiment(words)
+    calls = [
+        partial(trained, folder / f"{track}-{without or 'whole'}-{seed}", [*words, f"seed={seed}"])
+        for track, without, words in asked
+        for seed in range(options.seeds)
+    ]
+    print(f"{len(calls)} runs of {len(asked)} groups, {options.jobs} at once", flush=True)
+    runs = at_once(options.jobs, calls)
+    rows = []
+    for index, (track, without, _) in enumerate(asked):
+        driven = [measure(run) for run in runs[index * options.seeds : (index + 1) * options.seeds]]
+        figures = {name: over_seeds([one[name] for one in driven]) for name in driven[0]}
+        rows.append({"track": track, "without": without, **figures})
+        print(table(HEAD, [_cells(rows[-1])]), flush=True)
+    return rows
+
+
+HEAD = (
+    *(
+        "track, without",
+        "steps",
+        "training (min)",
+        "laps: simulator",
+        SIM2REAL,
+        "picture",
+        "timing",
+        "controls",
+    ),
+    *("car", "lap (s): simulator", "car", "zig-zag /m: simulator", "car"),
+)
+
+
+def _cells(row: dict[str, Any]) -> tuple[str, ...]:
+    def minutes(value: float | None) -> str:
+        return number(None if value is None else value / 60, 1)
+
+    seconds = partial(number, digits=2)
+    laps = [iqm_text(row[f"laps_{name}"], percent) for name in protocols()]
+    return (
+        f"{row['track']}, {row['without'] or 'nothing'}",
+        iqm_text(row["steps"], number),
+        iqm_text(row["train_s"], minutes),
+        *laps,
+        *(iqm_text(row[f"lap_s_{name}"], seconds) for name in (SIMULATOR, CAR)),
+        *(iqm_text(row[f"zigzag_{name}"], seconds) for name in (SIMULATOR, CAR)),
+    )
+
+
+@with_exit_code
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Measure and print."""
+    """Measure, print and store."""
     parser = benchmark_parser("real_car", __doc__)
     parser.add_argument("--seeds", type=int, default=5, help="trainings of each, with the seeds 0, 1, ...")
+    parser.add_argument("--tracks", type=_names, default=TRACKS, help=f"default: {','.join(TRACKS)}")
+    known = ",".join(WITHOUT)
     parser.add_argument(
-        "--folder", type=Path, default=Path("real_car"), help="of the runs (default: real_car)"
+        "--without", type=_names, default=("smoothness",), help=f"some of {known}; default: smoothness"
     )
+    parser.add_argument("--jobs", type=int, default=1, help="trainings at once")
+    parser.add_argument("--runs-dir", type=Path, help="folder of the runs; left out: they are not kept")
     options = parser.parse_args(arguments)
-    seeds = [
-        measure(options.folder / f"seed{seed}", seed, options.overrides) for seed in range(options.seeds)
-    ]
-    found = summarize(seeds)
-    columns: dict[tuple[str, str], Callable[[float | None], str]] = {
-        ("complete laps", "lap_share"): percent,
-        ("lap (s)", "lap_time_s"): partial(number, digits=2),
-    }
-    head = ["as on the car", *(f"{what}, trained {way}" for what, _ in columns for way in WAYS)]
-    rows = [
-        (
-            {"simulator": "nothing", "car": "all"}.get(name, name),
-            *(interval_text(one[figure][way], show) for (_, figure), show in columns.items() for way in WAYS),
-        )
-        for name, one in found.items()
-    ]
-    print(f"\n{table(head, rows)}")
-    given = {"teacher_steps": TEACHER_STEPS, "iterations": ITERATIONS, "starts": STARTS}
-    result = {"figures": found, "seeds": seeds, **given, "overrides": options.overrides}
-    write_json(options.json, result)
+    unknown = [name for name in options.without if name not in WITHOUT]
+    if unknown:
+        raise BadInput(f"--without {','.join(unknown)}", "no such ingredient", known)
+    if options.seeds < 1 or options.jobs < 1:
+        raise BadInput("--seeds and --jobs: accepted: 1 or more")
+    with tempfile.TemporaryDirectory() as temporary:
+        rows = benchmark(options, (options.runs_dir or Path(temporary)).resolve())
+    print(f"\n{table(HEAD, list(map(_cells, rows)))}")
+    wanted = ", ".join(f"{share:.0%} ({name})" for name, share in WANTED.items())
+    print(f"\nwanted within {WANTED_S / 60:.0f} minutes on two cores: laps {wanted}; half of the zig-zag")
+    write_json(
+        options.json,
+        {"trainings": rows, "trials": TRIALS, "seeds": options.seeds, "overrides": options.overrides},
+    )
+
+
+def _names(text: str) -> list[str]:
+    return [name for name in text.split(",") if name]
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -1,22 +1,103 @@
+"""The benchmark of the physical car trains what it says and drives it under each of the car's parts."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
 import pytest
 
-from benchmarks.real_car import summarize
+from benchmarks import real_car
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.evaluation.evaluate import CAR, SIMULATOR
+from tests.conftest import Ended
 
 
-def test_what_randomization_gains_is_compared_seed_by_seed():
-    def driven(share, time_s):
-        return {"car": {"lap_share": share, "completion": share, "lap_time_s": time_s}}
+def test_a_training_without_an_ingredient_differs_in_that_alone() -> None:
+    whole = compose_experiment(real_car.training_overrides("reinvent_base", None, []))[0]
+    assert whole.randomization.real_car is not None
+    for without, changed in {
+        "smoothness": {"algorithm": replace(whole.algorithm, smoothness=0.0)},
+        "car": {"randomization": compose_experiment(["randomization=sim2real"])[0].randomization},
+        "speeds": {"action_space": compose_experiment([])[0].action_space},
+        "sim2real": {"randomization": compose_experiment([])[0].randomization},
+    }.items():
+        other = compose_experiment(real_car.training_overrides("reinvent_base", without, []))[0]
+        assert other == replace(whole, **changed) != whole
 
-    seeds = [
-        {"without": driven(0.2, None), "with": driven(0.8, 10.0)},
-        {"without": driven(0.4, 9.0), "with": driven(1.0, 11.0)},
-        {"without": driven(0.0, 8.0), "with": driven(0.3, 10.5)},
+
+def test_a_policy_drives_in_the_simulator_under_sim2real_and_as_the_car_in_parts() -> None:
+    protocols = real_car.protocols()
+    assert list(protocols) == [SIMULATOR, "sim2real", "picture", "timing", "controls", CAR]
+    assert [config.usual for config in protocols.values()] == ["none", "sim2real", *["none"] * 4]
+    assert protocols[SIMULATOR].real_car is protocols["sim2real"].real_car is None
+    assert None not in vars(protocols[CAR].real_car).values()
+    # None of its starts is one of the training's evaluations.
+    trained = compose_experiment(["experiment=real_car"])[0].evaluation
+    starts = {round(start * trained.trials * 2, 6) for start in protocols[CAR].starts}
+    assert not any(start == round(start) for start in starts)
+
+
+def test_each_seed_is_trained_whole_and_without(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = []
+
+    def train(folder: Path, overrides: list[str]) -> Path:
+        asked.append((folder.name, *overrides[-2:]))
+        return folder
+
+    figures = ["steps", "train_s", "zigzag_simulator", "zigzag_car"]
+    figures += [f"{what}_{name}" for what in ("laps", "lap_s") for name in real_car.protocols()]
+
+    def measured(run: Path) -> dict[str, float | None]:
+        return {**dict.fromkeys(figures, 120.0), "laps_car": 0.8, "lap_s_car": [8.0, None][int(run.name[-1])]}
+
+    monkeypatch.setattr(real_car, "trained", train)
+    monkeypatch.setattr(real_car, "measure", measured)
+    file = tmp_path / "real_car.json"
+    words = ["--seeds", "2", "--tracks", "Oval_track", "--without", "car", "network=shallow"]
+    assert real_car.main([*words, "--runs-dir", str(tmp_path), "--json", str(file)]) == 0
+    assert asked == [
+        (f"Oval_track-{name}-{seed}", "network=shallow", f"seed={seed}")
+        for name in ("whole", "car")
+        for seed in (0, 1)
     ]
-    found = summarize(seeds)["car"]
-    assert found["lap_share"]["with"]["mean"] == pytest.approx(0.7)
-    assert found["lap_share"]["gain"]["mean"] == pytest.approx(0.5)
-    # Student's t of three: 4.303 standard errors of 0.1.
-    assert found["lap_share"]["gain"]["interval"] == pytest.approx([0.0697, 0.9303], abs=1e-3)
-    # A seed without a lap has no lap time, and nothing to compare.
-    assert found["lap_time_s"]["without"]["mean"] == pytest.approx(8.5)
-    assert found["lap_time_s"]["gain"]["mean"] == pytest.approx(2.25)
+    whole, without = json.loads(file.read_text())["trainings"]
+    assert (whole["track"], whole["without"], without["without"]) == ("Oval_track", None, "car")
+    assert whole["laps_car"]["iqm"] == 0.8
+    assert whole["lap_s_car"]["seeds"] == [8.0, None]
+    out = capsys.readouterr().out
+    assert "| Oval_track, nothing |" in out
+    assert "95% (simulator), 90% (sim2real), 90% (car)" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("--without", "luck"), "--without luck"),
+        (("--tracks", "nowhere"), "nowhere"),
+        (("--seeds", "0"), "--seeds"),
+    ],
+    ids=" ".join,
+)
+def test_what_is_unknown_is_refused_before_a_training(
+    words: tuple[str, ...], named: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert real_car.main(list(words)) == 2
+    assert named in capsys.readouterr().err
+
+
+def test_a_run_is_measured_under_each_condition(
+    monkeypatch: pytest.MonkeyPatch, trained: Callable[..., Ended]
+) -> None:
+    camera = ("observation=camera", "collector.cars=4", "algorithm.frames_per_iteration=64")
+    run = trained(*camera, "algorithm.epochs=1", "budget.env_steps=64", "checkpoints.every=null").folder
+    asked = real_car.protocols()
+    short = {name: replace(config, time_s=0.5, trials=1) for name, config in asked.items()}
+    monkeypatch.setattr(real_car, "protocols", lambda: short)
+    found = real_car.measure(run)
+    assert found["steps"] == 64
+    assert {name for name in found if name.startswith("laps_")} == {f"laps_{name}" for name in asked}
+    assert all(found[f"laps_{name}"] == 0.0 for name in asked if found[f"laps_{name}"] is not None)
+    assert {"zigzag_simulator", "zigzag_car"} <= set(found)
