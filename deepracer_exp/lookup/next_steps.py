@@ -75,8 +75,8 @@ def outcome(run: RunRecord) -> list[tuple[str, str]]:
 def official_place(run: RunRecord) -> str | None:
     """Return where the mean of the evaluated laps would stand on the official board of a run's track, in words.
 
-    None: there is no complete lap, the run has several tracks or others on the road, or its track has no board or is
-    driven the other way.
+    None: there is no complete lap, the run has several tracks or others on the road, its laps are those of the physical
+    car, or its track has no board or is driven the other way.
 
     Raises:
         BadInput: as for `outcome`.
@@ -88,7 +88,7 @@ def official_place(run: RunRecord) -> str | None:
     race = config.get("race") or {}
     others = [race.get(kind) or {} for kind in ("boxes", "bots")]
     alone = alone and not any(some.get("number") or some.get("positions") for some in others)
-    if mean_lap_s is None or not alone or protocol.get("tracks") is not None:
+    if mean_lap_s is None or not alone or protocol.get("tracks") is not None or protocol.get("real_car"):
         return None
     observation, penalty_s = config.get("observation") or {}, protocol.get("penalty_s") or {}
     places = standings(
@@ -124,6 +124,13 @@ def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
             film,
             (command_line("clone", word, config), "train it further, at a tenth of the learning rate"),
         ]
+        if config["evaluation"].get("real_car"):
+            steps[0] = (
+                f"{evaluate} evaluation=real_car",
+                "race the best checkpoint as the physical car would",
+            )
+            export = command_line("export", word, config, OF_POLICY)
+            steps.insert(1, (f"{export} format=car", "write the archive for the car's console"))
     if summary["status"] in (INTERRUPTED, FAILED):
         return [(resume, "continue it from its last checkpoint"), *steps]
     limit = summary.get("limit")

@@ -4,6 +4,7 @@ import shlex
 import shutil
 
 import pytest
+import yaml
 
 from deepracer_exp.lookup.next_steps import next_steps, own_word, run_word
 from deepracer_exp.lookup.resolve import resolve
@@ -33,6 +34,18 @@ def test_the_best_run_has_a_short_name_and_so_has_another(runs):
 def test_a_run_elsewhere_is_named_by_its_folder(runs, tmp_path_factory, monkeypatch):
     monkeypatch.chdir(tmp_path_factory.mktemp("elsewhere"))
     assert run_word(runs[0].absolute()) == str(runs[0].absolute())
+
+
+def test_a_policy_for_the_car_is_raced_as_the_car_and_exported(runs):
+    run = runs[1]
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    plain = [line for line, _ in next_steps(run, read_object(run / "summary.json"))]
+    config["evaluation"]["real_car"] = {"picture": {"jpeg_quality": 95}, "timing": None, "controls": None}
+    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    first, second, *others = [line for line, _ in next_steps(run, read_object(run / "summary.json"))]
+    assert first == f"{plain[0]} evaluation=real_car"
+    assert second == f"deepracer-exp export {run_word(run)} format=car"
+    assert others == plain[1:]
 
 
 @pytest.mark.parametrize(
