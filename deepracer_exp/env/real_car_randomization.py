@@ -86,21 +86,19 @@ class RealCarRandomization:
         return split_delay(delay_s, self._batch.car.control_period_s)
 
 
-def _ranges(
-    config: CarRandomizationConfig | None, fixed: RealCarConfig | None
-) -> tuple[tuple[float, ...], ...]:
+def _ranges(config: CarRandomizationConfig | None, fixed: RealCarConfig | None) -> Sequence[Sequence[float]]:
     """Return the ranges of a car in the order of `_OFF`."""
-    quality, latency_s, lock_deg, curve = _OFF
+    ranges: list[Sequence[float]] = list(_OFF)
     if config is not None and config.picture is not None:
-        quality = config.picture.jpeg_quality
+        ranges[_QUALITY] = config.picture.jpeg_quality
     if config is not None and config.timing is not None:
-        latency_s = config.timing.latency_s
+        ranges[_LATENCY] = config.timing.latency_s
     if config is not None and config.controls is not None:
-        lock_deg, curve = config.controls.full_lock_deg, config.controls.throttle_curve
+        ranges[_LOCK], ranges[_CURVE] = config.controls.full_lock_deg, config.controls.throttle_curve
     if fixed is not None and fixed.picture is not None:
-        quality = 2 * (fixed.picture.jpeg_quality or UNCOMPRESSED,)
+        ranges[_QUALITY] = [fixed.picture.jpeg_quality or UNCOMPRESSED] * 2
     if fixed is not None and fixed.timing is not None:
-        latency_s = 0.0, 0.0
+        ranges[_LATENCY] = [0.0, 0.0]
     if fixed is not None and fixed.controls is not None:
-        lock_deg, curve = 2 * (fixed.controls.full_lock_deg,), (1.0, 1.0)
-    return quality, latency_s, lock_deg, curve
+        ranges[_LOCK], ranges[_CURVE] = [fixed.controls.full_lock_deg] * 2, [1.0, 1.0]
+    return ranges
