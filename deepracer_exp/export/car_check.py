@@ -23,7 +23,6 @@ from deepracer_exp.env.trace import PACKED, STATUS_CODE
 from deepracer_exp.errors import RunFailed, writing
 from deepracer_exp.evaluation.evaluate import (
     CAR,
-    CURES,
     SIMULATOR,
     car_figures,
     car_protocols,
@@ -104,20 +103,18 @@ class CarCheck:
                 "further (deepracer-exp clone)"
             )
         parts = [name for name in weak if name != CAR]
-        for name in parts or weak:
-            cure = CURES.get(name)
-            steps.append(
-                f"as on the car, {'all parts together' if name == CAR else name}: {shares[name]:.0%} of the laps are "
-                f"complete, wanted {LEAST_ON_CAR:.0%}; train with randomization=sim2real"
-                + (f" ({cure})" if cure else "")
-            )
+        steps += [
+            f"as on the car, {'all parts together' if name == CAR else name}: {shares[name]:.0%} of the laps are "
+            f"complete, wanted {LEAST_ON_CAR:.0%}; train with randomization=real_car"
+            for name in parts or weak
+        ]
         changes_per_m, amplitude_deg = self.zigzag.changes_per_m, self.zigzag.amplitude_deg
         if (changes_per_m or 0.0) >= ZIGZAG_PER_M and (amplitude_deg or 0.0) >= ZIGZAG_DEG:
             steps.append(f"it zig-zags on straights; try {CURE}")
         if self.pictures.bad_share > MOST_BAD:
             steps.append(
                 f"{self.pictures.bad_share:.0%} of the pictures decide badly, wanted {MOST_BAD:.0%}; train with the "
-                "pictures of randomization=sim2real"
+                "pictures of randomization=real_car"
             )
         return steps
 

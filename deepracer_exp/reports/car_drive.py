@@ -23,7 +23,7 @@ from deepracer_exp.analysis.charts.car_drive import drive_charts
 from deepracer_exp.aws.logs.car_log import CarLog
 from deepracer_exp.aws.models.car_controls import full_scale, steering_share, throttle
 from deepracer_exp.env.action_space import build_action_space, metadata_of
-from deepracer_exp.env.real_car import CAR_PICTURE, FRAME_SCALE, car_pictures, check_car
+from deepracer_exp.env.real_car import CAR_PICTURE, FRAME_SCALE, UNCOMPRESSED, car_pictures, check_car
 from deepracer_exp.errors import BadInput, reading
 from deepracer_exp.evaluation.film import png
 from deepracer_exp.files import atomic_write
@@ -112,7 +112,7 @@ def grey_pictures(log: CarLog, row: int) -> NDArray[np.uint8]:
                 )
             grey = np.asarray(picture.convert("L"))
         whole = grey.shape == (height, width)
-        shown.append(grey if whole else car_pictures(grey[None, None], None)[0, 0])
+        shown.append(grey if whole else car_pictures(grey[None, None], UNCOMPRESSED)[0, 0])
     return np.stack(shown)
 
 
