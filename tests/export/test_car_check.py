@@ -77,7 +77,10 @@ def test_a_policy_that_loses_nothing_is_ready():
         ({"network_s": 0.02}, "network=cnn_small"),
         ({SIMULATOR: 0.9}, "train further"),
         ({"picture": 0.85}, "picture: 85% of the laps are complete, wanted 90%"),
-        ({"controls": 0.5}, "speed_noise"),
+        (
+            {"controls": 0.5},
+            "controls: 50% of the laps are complete, wanted 90%; train with randomization=real_car",
+        ),
         ({CAR: 0.8}, "all parts together"),
         ({"zigzag": SWERVING}, "zig-zags"),
         ({"pictures": (200, 110)}, "50% of the pictures decide badly"),
