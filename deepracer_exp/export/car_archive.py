@@ -1,6 +1,7 @@
 """A policy of ours as the archive that the software of a physical car loads."""
 
 import json
+import shlex
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -31,6 +32,7 @@ from deepracer_exp.config.learning import CNNConfig
 from deepracer_exp.env.action_space import ActionSpace, ContinuousActions, build_action_space, metadata_of
 from deepracer_exp.env.real_car import check_car
 from deepracer_exp.errors import BadInput
+from deepracer_exp.lookup.next_steps import own_word
 from deepracer_exp.lookup.resolve import StoredRun
 
 from .aws_files import sensor_keys
@@ -70,6 +72,7 @@ def export_car(run: StoredRun, _: str, path: Path) -> Written:
         *archive.notes,
         "What the car makes of the actions, with its maximum speed at 100%:",
         *describe_commands(archive.metadata),
+        f"check it before the drive: deepracer-exp check {shlex.quote(own_word(run.path))} --car",
     ]
 
 

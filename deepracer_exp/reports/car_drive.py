@@ -30,7 +30,7 @@ from deepracer_exp.files import atomic_write
 from deepracer_exp.lookup.resolve import StoredRun
 
 from .page import Glimpse, plot_of, png_uri, render
-from .picture_changes import decide
+from .picture_changes import decide, spread_out
 from .sight import picture_of, saliency, under_heat
 
 _AT_ONCE = 256
@@ -146,12 +146,9 @@ def _glimpses(log: CarLog, policy: DrivenPolicy | None, decisions: Decisions | N
     """Return the pictures on which the car hesitates most or a policy decides most differently; else evenly spread."""
     rows = [(spell.first + spell.last) // 2 for spell in spells(log)]
     if decisions is not None:
-        apart, against = np.nan_to_num(np.abs(differences(log, decisions))), list[int]()
-        for row in np.argsort(-apart, kind="stable").tolist():
-            if apart[row] == 0 or len(against) == _GLIMPSES // 2:
-                break
-            if all(abs(log.time_s[row] - log.time_s[other]) >= _APART_S for other in against):
-                against.append(row)
+        apart = np.nan_to_num(np.abs(differences(log, decisions)))
+        order = np.argsort(-apart, kind="stable")
+        against = spread_out(order[apart[order] > 0], log.time_s, _APART_S, _GLIMPSES // 2)
         rows = [*against, *rows]
     rows += np.linspace(0, len(log) - 1, _GLIMPSES).astype(int).tolist()
     names, strip = action_names(log), []

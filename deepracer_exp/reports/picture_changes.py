@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,6 +24,8 @@ BAD_SHARE = 0.5
 _BATCH = 64
 _SHOWN, _ACROSS, _WIDTH, _LINE = 8, 4, 320, 44
 """Pictures on a sheet, in a row; pixels of one and of the words below it."""
+_APART = 8
+"""Pictures between two on a sheet: neighbours look alike."""
 
 Pixels = NDArray[np.uint8]
 
@@ -102,9 +105,20 @@ def decide(policy: nn.Module, seen: TensorDict) -> TensorDict:
         return torch.cat([policy(part.clone()) for part in seen.split(_BATCH)])
 
 
+def spread_out(rows: NDArray[np.intp], place: NDArray[Any], least: float, most: int) -> list[int]:
+    """Return the first of some rows whose places are at least so far from one another, at most `most` of them."""
+    chosen: list[int] = []
+    for row in rows.tolist():
+        if len(chosen) == most:
+            break
+        if all(abs(place[row] - place[other]) >= least for other in chosen):
+            chosen.append(row)
+    return chosen
+
+
 def pictures_sheet(tried: TriedPictures, policy: nn.Module, camera: CameraConfig) -> Image.Image:
     """Draw the worst pictures that decide badly under their saliency, each with its decisions."""
-    shown = tried.bad[:_SHOWN]
+    shown = spread_out(tried.bad, np.arange(len(tried.commands[0])), _APART, _SHOWN)
     height = _WIDTH * camera.height // (camera.width * (2 if camera.stereo_m else 1))
     rows = -(-len(shown) // _ACROSS)
     sheet = Image.new("RGB", (_ACROSS * _WIDTH, rows * (height + _LINE)), "#14171a")
@@ -117,7 +131,7 @@ def pictures_sheet(tried: TriedPictures, policy: nn.Module, camera: CameraConfig
         steering_deg = tried.commands[0][step]
         change = max(tried.turned_deg, key=lambda name: abs(tried.turned_deg[name][step]))
         words = (
-            f"picture {step}: {degrees(steering_deg)}",
+            f"picture {step + 1} of {len(tried.commands[0])}: {degrees(steering_deg)}",
             f"{change}: {degrees(steering_deg + tried.turned_deg[change][step])}",
         )
         for line, text in enumerate(words):

@@ -13,7 +13,7 @@ from deepracer_exp.evaluation.evaluate import CAR, SIMULATOR
 from deepracer_exp.evaluation.race_protocol import Attempt
 from deepracer_exp.evaluation.result import USUAL, Evaluation, TrialGroup
 from deepracer_exp.export.car_check import CarCheck, CarLaps
-from deepracer_exp.reports.picture_changes import CHANGES, pictures_sheet, try_pictures
+from deepracer_exp.reports.picture_changes import CHANGES, pictures_sheet, spread_out, try_pictures
 
 CAMERA = CameraConfig(width=160, height=120, color="grey", frames=1, stereo_m=0.0, field_of_view_deg=65.0)
 ACTIONS = DiscreteActions(np.array([-20.0, 20.0]), np.array([1.0, 2.0]))
@@ -105,6 +105,12 @@ def test_only_pictures_in_which_a_small_change_turns_the_wheels_decide_badly():
     sheet = pictures_sheet(tried, policy, CAMERA)
     assert sheet.width == 4 * 320
     assert 240 < sheet.height < 320
+
+
+def test_a_sheet_shows_no_neighbours():
+    rows = np.array([50, 51, 49, 10, 58, 57, 100])
+    assert spread_out(rows, np.arange(200), 8, 8) == [50, 10, 58, 100]
+    assert spread_out(rows, np.arange(200), 8, 2) == [50, 10]
 
 
 def test_changes_keep_size_and_kind_of_pictures_and_move_rows_the_way_they_say():
