@@ -1,6 +1,7 @@
 """The pictures of an observation: what each car's camera sees now, and saw before."""
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.driving import CameraConfig
 from deepracer_exp.config.track import FloorConfig
-from deepracer_exp.sim.batch import CarState
+from deepracer_exp.sim.batch import CarState, cores
 from deepracer_exp.sim.camera import take_pictures
 from deepracer_exp.sim.lens import Lens
 from deepracer_exp.sim.scenery import MATERIALS, build_scenery, join_sceneries
@@ -23,8 +24,8 @@ GREY = np.array([0.299, 0.587, 0.114], np.float32)
 """Weights of red, green and blue in the service's grey (ITU-R BT.601; deepracer-simapp turns RGB into luminance)."""
 _WALL_Y_LIGHT = 0.3
 """Brightness of the walls along the x axis relative to the others, in recorded frames (`benchmarks.camera`)."""
-_FRAMES_AT_ONCE = 16
-"""Frames of the physical car's camera: of grey ones, 5 MB."""
+_FRAMES_AT_ONCE, _PICTURES_AT_ONCE = 16, 256
+"""Frames of the physical car's camera, and pictures of the simulator's, that one thread takes at once: 5 MB in grey."""
 
 Pixels = NDArray[np.uint8]
 
@@ -43,8 +44,9 @@ class Pictures:
         tracks: Sequence[Track],
         varied: PictureRandomization | None,
         jpeg_quality: NDArray[np.int64],
+        threads: int = 1,
     ) -> None:
-        """Build the scenery.
+        """Build the scenery; `threads` take the pictures, 0 means one per core.
 
         `varied` differs from episode to episode and is drawn before the pictures are taken. `jpeg_quality` of each car,
         (N,), makes pictures as the physical car does; `AS_SIMULATED` leaves each pixel the mean of what it sees. Later
@@ -52,6 +54,9 @@ class Pictures:
         """
         self._jpeg_quality = jpeg_quality
         self._varied = varied
+        self._threads = threads or cores()
+        # They begin with the first pictures: a process may still fork.
+        self._pool = ThreadPoolExecutor(self._threads)
         self.shape = config.shape
         self._now = config.shape[0] // config.frames  # channels of one moment
         sides_m = (0.5 * config.stereo_m, -0.5 * config.stereo_m) if config.stereo_m else (0.0,)
@@ -129,6 +134,28 @@ class Pictures:
     ) -> Pixels:
         ahead, left = self._tilt_rad_per_mps2 * acceleration_mps2.T
         poses = np.stack([state.x_m, state.y_m, state.yaw_rad, -ahead, left], axis=1)
+        most = _FRAMES_AT_ONCE if (self._jpeg_quality[ids] != AS_SIMULATED).any() else _PICTURES_AT_ONCE
+        size = min(most, -(-len(ids) // self._threads))
+        if len(ids) <= size:
+            return self._take_some(ids, poses, course, steps, others)
+
+        def take(first: int) -> Pixels:
+            rows = slice(first, first + size)
+            around = None if others is None else others[rows]
+            return self._take_some(ids[rows], poses[rows], course[rows], steps[rows], around)
+
+        # Neither the drawing nor the compression holds Python's lock.
+        how = map if self._threads == 1 else self._pool.map
+        return np.concatenate(list(how(take, range(0, len(ids), size))))
+
+    def _take_some(
+        self,
+        ids: Ids,
+        poses: NDArray[np.float64],
+        course: NDArray[np.intp],
+        steps: NDArray[np.int64],
+        others: NDArray[np.float32] | None,
+    ) -> Pixels:
         varied = self._varied
         colors, boxes = self._floor_colors[course], others
         if varied is not None:
@@ -154,26 +181,19 @@ class Pictures:
         boxes: NDArray[np.float32] | None,
     ) -> Pixels:
         """Return what cars see through a lens, (n, channels, height, width): arguments as for `take_pictures`."""
-        size = (colors.shape[-1], lens.height, lens.width)
         is_real = self._jpeg_quality[ids] != AS_SIMULATED
-        if not is_real.any():
-            mounts = None if self._varied is None else self._varied.mounts(ids, lens.mount)
-            out = np.empty((len(ids), *size), np.uint8)
-            return take_pictures(lens, self._scenery, poses, course, colors, out, mounts, boxes)
-        if is_real.all() and len(ids) <= _FRAMES_AT_ONCE:
-            channels, height, width = size
-            frames = np.empty((len(ids), channels, FRAME_SCALE * height, FRAME_SCALE * width), np.uint8)
-            finer = replace(lens, height=frames.shape[-2], width=frames.shape[-1])
-            mounts = None if self._varied is None else self._varied.mounts(ids, finer.mount)
-            take_pictures(finer, self._scenery, poses, course, colors, frames, mounts, boxes)
-            return car_pictures(frames, self._jpeg_quality[ids])
-        out = np.empty((len(ids), *size), np.uint8)
-        real = np.flatnonzero(is_real)
-        some = [real[first : first + _FRAMES_AT_ONCE] for first in range(0, len(real), _FRAMES_AT_ONCE)]
-        for rows in (np.flatnonzero(~is_real), *some):
-            around = None if boxes is None else boxes[rows]
-            out[rows] = self._shoot(lens, ids[rows], poses[rows], course[rows], colors[rows], around)
-        return out
+        if is_real.any() and not is_real.all():
+            out = np.empty((len(ids), colors.shape[-1], lens.height, lens.width), np.uint8)
+            for rows in (np.flatnonzero(is_real), np.flatnonzero(~is_real)):
+                around = None if boxes is None else boxes[rows]
+                out[rows] = self._shoot(lens, ids[rows], poses[rows], course[rows], colors[rows], around)
+            return out
+        if is_real.any():
+            lens = replace(lens, width=FRAME_SCALE * lens.width, height=FRAME_SCALE * lens.height)
+        mounts = None if self._varied is None else self._varied.mounts(ids, lens.mount)
+        out = np.empty((len(ids), colors.shape[-1], lens.height, lens.width), np.uint8)
+        take_pictures(lens, self._scenery, poses, course, colors, out, mounts, boxes)
+        return car_pictures(out, self._jpeg_quality[ids]) if is_real.any() else out
 
 
 def floor_colors(floor: FloorConfig) -> NDArray[np.float32]:

@@ -79,7 +79,7 @@ class Race:
         Args:
             setup: what the experiment chose.
             n_cars: cars in this batch.
-            threads: physics threads; 0 means one per core.
+            threads: of physics and cameras; 0 means one per core.
             first_car: number of the first car over all processes, which its random stream and starts depend on.
             prints: where `print` of a reward function goes; None: nowhere.
             randomizations: of each car, (N,); None: the setup's for all.
@@ -134,7 +134,7 @@ class Race:
         self._pictures = (
             None
             if camera is None
-            else Pictures(camera, setup.car, tracks, self._varied, real_car.jpeg_quality)
+            else Pictures(camera, setup.car, tracks, self._varied, real_car.jpeg_quality, threads)
         )
         top_mps = None if fixed is None or fixed.controls is None else fixed.controls.full_throttle_mps
         self._servos = (

@@ -139,6 +139,18 @@ def test_cars_of_all_kinds_see_and_drive_together_as_alone():
             np.testing.assert_array_equal(race.pixels[0], together.pixels[car])
 
 
+@pytest.mark.parametrize("option", ["sim2real", "real_car"])
+def test_any_number_of_threads_takes_the_same_pictures(option):
+    setup = make_setup(*CAMERA, f"randomization={option}", "race=object_avoidance")
+    races = [Race(setup, 19, threads=threads) for threads in (1, 3)]
+    for race in races:
+        race.reset()
+        for action in random_actions(2, 19):
+            race.step(action)
+    np.testing.assert_array_equal(races[0].pixels, races[1].pixels)
+    assert len(np.unique(races[0].pixels, axis=0)) == 19
+
+
 def test_a_proportional_throttle_and_a_lock_of_the_largest_angle_drive_as_the_simulator():
     setup = make_setup("action_space=continuous")
     as_commanded = CarControlsRanges(full_lock_deg=(30.0, 30.0), throttle_curve=(0.0, 0.0))
