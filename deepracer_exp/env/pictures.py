@@ -144,7 +144,7 @@ class Pictures:
             around = None if others is None else others[rows]
             return self._take_some(ids[rows], poses[rows], course[rows], steps[rows], around)
 
-        # Neither the drawing nor the compression holds Python's lock.
+        # Drawing, most of the work, does not hold Python's lock.
         how = map if self._threads == 1 else self._pool.map
         return np.concatenate(list(how(take, range(0, len(ids), size))))
 
