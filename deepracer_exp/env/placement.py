@@ -106,12 +106,13 @@ def draw_placements(
     if boxes.placement == "fixed":
         places_m[of_boxes] = np.array([position.lap for position in boxes.positions]) * length_m[:, None]
         lanes[of_boxes] = [LANES.index(position.lane) for position in boxes.positions]
-    else:
+    elif boxes.count:
         least_m = _least_m(race, length_m, episode)
         place(seeds, 0, boxes.placement == "random", least_m, length_m, places_m[of_boxes], lanes[of_boxes])
-    least_m = np.full(len(seeds), bots.min_distance_m)
-    random = bots.placement == "random"
-    place(seeds, boxes.count, random, least_m, length_m, places_m[of_bots], lanes[of_bots])
+    if bots.count:
+        least_m = np.full(len(seeds), bots.min_distance_m)
+        random = bots.placement == "random"
+        place(seeds, boxes.count, random, least_m, length_m, places_m[of_bots], lanes[of_bots])
     return places_m, lanes
 
 

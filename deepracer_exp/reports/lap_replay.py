@@ -220,7 +220,7 @@ def _chart(track: str, laps: Sequence[ReplayedLap]) -> Chart:
         title=track,
         caption="Position on the track is counted along the centre line from waypoint 0; curves are broken where it "
         "begins again. Behind: how much later a car came to where it is than the other one."
-        + " Squares are the boxes and bots around the car of their colour."
+        + " Squares are the boxes, bots and rivals around the car of their colour."
         * any(lap.others is not None for lap in laps),
         rows=[
             [map_panel(laps[0].track, [*paths, *cars])],

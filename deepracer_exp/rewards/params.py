@@ -1,6 +1,5 @@
 """The params dict that a reward function gets, as AWS DeepRacer defines it."""
 
-import itertools
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
@@ -20,6 +19,7 @@ _DTYPES: dict[str, type] = {
 }
 COLUMNS = tuple(_DTYPES)
 """The keys that differ from car to car: one row per car, two numbers a row in `closest_waypoints`."""
+_WAYPOINTS_PLACE = COLUMNS.index("closest_waypoints")
 BATCH_COLUMNS = (*COLUMNS, "previous_progress")
 """Columns of `reward_batch`, with the progress at the step before, which `reward_function` remembers by itself.
 
@@ -75,8 +75,13 @@ def select(columns: Mapping[str, np.ndarray], cars: NDArray[np.intp] | None) -> 
 
 
 def rows(selected: Mapping[str, np.ndarray]) -> Iterable[Row]:
-    """Return one tuple of Python values per car, in the order of `COLUMNS`."""
-    return zip(*(selected[key].tolist() for key in COLUMNS), strict=True)
+    """Return one tuple of Python values per car, in the order of `row_keys`."""
+    return zip(*(selected[key].tolist() for key in row_keys(selected)), strict=True)
+
+
+def row_keys(selected: Mapping[str, np.ndarray]) -> tuple[str, ...]:
+    """Return the keys of rows: `COLUMNS`, and after them those about others that there are."""
+    return (*COLUMNS, *object_keys(selected)) if MASK in selected else COLUMNS
 
 
 def object_keys(columns: Mapping[str, np.ndarray]) -> tuple[str, ...]:
@@ -84,34 +89,20 @@ def object_keys(columns: Mapping[str, np.ndarray]) -> tuple[str, ...]:
     return tuple(key for key in OBJECT_COLUMNS if key in columns)
 
 
-def object_rows(selected: Mapping[str, np.ndarray]) -> Iterable[dict[str, Any] | None]:
-    """Return the keys about others of each car with their Python values; None for cars that are alone."""
-    if MASK not in selected:
-        return itertools.repeat(None, len(selected["x"]))
-    keys = object_keys(selected)
-    if not keys:
-        return itertools.repeat({}, len(selected["x"]))
-    values = zip(*(selected[key].tolist() for key in keys), strict=True)
-    return map(dict, map(zip, itertools.repeat(keys), values))
-
-
-def scalar_params(row: Row, road: TrackParams, objects: dict[str, Any] | None = None) -> dict[str, Any]:
+def scalar_params(row: Row, road: TrackParams, keys: tuple[str, ...] = COLUMNS) -> dict[str, Any]:
     """Build the 27 keys for one car.
 
-    Every list is a fresh one, so that nothing a reward function does to it reaches another call; the keys
-    about other objects hold the defaults of an empty road (deepracer-simapp agent_ctrl/constants.py), unless there are
-    some.
+    Every list is a fresh one, so that nothing a reward function does to it reaches another call; the keys about other
+    objects that the row has not hold the defaults of an empty road (deepracer-simapp agent_ctrl/constants.py).
 
     Args:
-        row: One tuple of `rows`; lengths in metres, angles in degrees, speed in m/s, time in seconds.
+        row: One tuple of `rows`; lengths in metres, angles in degrees, speeds in m/s, time in seconds.
         road: The keys that are constant on the course.
-        objects: One of `object_rows`; distances in metres, headings in degrees, speeds in m/s.
+        keys: The `row_keys` of the row.
     """
-    params = dict(
-        zip(COLUMNS, row, strict=True),
+    params: dict[str, Any] = dict(
         track_length=road.track_length,
         waypoints=road.waypoints[:],
-        closest_waypoints=row[-1][:],
         is_reversed=road.is_reversed,
         is_crashed=False,
         closest_objects=[0, 0],
@@ -123,8 +114,8 @@ def scalar_params(row: Row, road: TrackParams, objects: dict[str, Any] | None = 
         objects_distance_from_center=[],
         objects_distance=[],
     )
-    if objects is not None:
-        params.update(objects)
+    params.update(zip(keys, row, strict=True))
+    params["closest_waypoints"] = row[_WAYPOINTS_PLACE][:]
     return params
 
 

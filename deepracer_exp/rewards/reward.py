@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from deepracer_exp.errors import BadInput, RunFailed
 
 from .guard import CtrlC, DeadlinePassed, Guard, Misconduct
-from .params import OBJECT_COLUMNS, TrackParams, batch_params, object_rows, rows, scalar_params, select
+from .params import OBJECT_COLUMNS, TrackParams, batch_params, row_keys, rows, scalar_params, select
 from .prints import RewardPrints
 from .reads import keys_read
 from .source import RewardSource, source_with_constants
@@ -178,11 +178,11 @@ class RewardFunction:
         functions = self.functions
         rewards: list[float] = []
         table, own_params = list(rows(selected)), [track_params[place] for place in track_of.tolist()]
-        others = list(object_rows(selected))
+        keys = row_keys(selected)
         try:
             with Guard(self.time_limit_s):
-                for car, road, row, objects in zip(cars, own_params, table, others, strict=True):
-                    reward = functions[car](scalar_params(row, road, objects))
+                for car, road, row in zip(cars, own_params, table, strict=True):
+                    reward = functions[car](scalar_params(row, road, keys))
                     # A float within the bounds needs no further check; NaN fails the comparison.
                     if type(reward) is not float or not -MAX_REWARD <= reward <= MAX_REWARD:
                         reward = _as_reward(reward)
@@ -192,7 +192,7 @@ class RewardFunction:
         except BaseException as error:  # noqa: BLE001 - raised again as one of ours
             # There is a reward for each car so far; the time limit may be exceeded right after the last one.
             failed = min(len(rewards), len(cars) - 1)
-            self._fail(error, cars[failed], scalar_params(table[failed], own_params[failed], others[failed]))
+            self._fail(error, cars[failed], scalar_params(table[failed], own_params[failed], keys))
         return rewards
 
     def _call_batch(
@@ -226,9 +226,8 @@ class RewardFunction:
         bad = np.flatnonzero(~(np.abs(rewards) <= MAX_REWARD))
         if len(bad):
             row, road = list(rows(selected))[bad[0]], track_params[track_of[bad[0]]]
-            objects = list(object_rows(selected))[bad[0]]
             no_reward = Unusable(_no_reward(float(rewards[bad[0]])))
-            self._fail(no_reward, cars[bad[0]], scalar_params(row, road, objects))
+            self._fail(no_reward, cars[bad[0]], scalar_params(row, road, row_keys(selected)))
         return rewards
 
     def _fail(self, error: BaseException, car: int | None, params: dict[str, Any]) -> NoReturn:

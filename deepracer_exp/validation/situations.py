@@ -11,7 +11,7 @@ from deepracer_exp.env.action_space import ContinuousActions
 from deepracer_exp.env.placement import Placement
 from deepracer_exp.env.rules import RaceRules
 from deepracer_exp.env.setup import RaceSetup
-from deepracer_exp.rewards.params import TrackParams, object_rows, rows, scalar_params, select
+from deepracer_exp.rewards.params import TrackParams, row_keys, rows, scalar_params, select
 from deepracer_exp.sim.batch import CarState
 from deepracer_exp.tracks.lanes import INNER, OUTER
 from deepracer_exp.tracks.track import Track
@@ -37,8 +37,9 @@ class Situations:
     def params(self) -> Iterator[dict[str, Any]]:
         """Yield fresh params of each situation."""
         selected = select(self.columns, np.arange(len(self)))
-        for row, objects in zip(rows(selected), object_rows(selected), strict=True):
-            yield scalar_params(row, self.road, objects)
+        keys = row_keys(selected)
+        for row in rows(selected):
+            yield scalar_params(row, self.road, keys)
 
     def __getitem__(self, which: slice | np.ndarray) -> "Situations":
         """Return a selection; an array of numbers may repeat some."""

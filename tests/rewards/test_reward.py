@@ -23,7 +23,7 @@ from deepracer_exp.rewards.params import (
     OBJECT_COLUMNS,
     TrackParams,
     batch_params,
-    object_rows,
+    row_keys,
     rows,
     scalar_params,
     select,
@@ -111,8 +111,8 @@ def test_params_about_others_are_lists_for_one_car_and_arrays_for_many() -> None
     given["closest_objects"] = np.array([[0, 1], [2, 3], [3, 0]])
     selected = select({**columns(n), **given}, np.array([0, 2]))
     batch = batch_params(selected, ROAD[0], np.array(WAYPOINTS))
-    for place, (row, objects) in enumerate(zip(rows(selected), object_rows(selected), strict=True)):
-        params = scalar_params(row, ROAD[0], objects)
+    for place, row in enumerate(rows(selected)):
+        params = scalar_params(row, ROAD[0], row_keys(selected))
         assert {key: type(value) for key, value in params.items()} == KEYS
         assert type(params["closest_objects"][0]) is int
         for key in OBJECT_COLUMNS:
