@@ -259,7 +259,7 @@ def test_a_restored_race_continues_bit_for_bit(duel):
         return np.array(rows)
 
     def build():
-        race = duel("randomization=sim2real", n_cars=8, rival=np.array([0.1, 0.1]))
+        race = duel("randomization=sim2real", "race.boxes.number=2", n_cars=8, rival=np.array([0.1, 0.1]))
         race.drive_with([Always(np.array([0.1, 0.1])), Always(np.array([-0.1, 0.3]))])
         return race
 
@@ -286,7 +286,7 @@ def test_environments_without_anybody_to_drive_the_rival_are_refused():
     assert "race.rivals.policy=pool" in refused(DeepRacerEnv, RACE)
 
 
-def test_a_rival_needs_a_closed_track_and_an_empty_road(tmp_path):
+def test_a_rival_needs_a_closed_track_and_no_bots(tmp_path):
     file = tmp_path / "straight.yaml"
     file.write_text("closed: false\nwidth_m: 1.0\nknots: [[0, 0], [1, 0], [2, 0.2], [3, 0], [4, 0]]\n")
     open_track = compose_experiment([*RACE[:2], f"track.file={file}"])[0]

@@ -50,7 +50,7 @@ def test_rivals_reach_the_workers_and_a_resumed_run_of_several_is_the_uninterrup
     def trained_by_two(name: str, *overrides: str):
         ended = call(
             *("train", *IN_WORKERS, "report=false", f"name={name}", *RACE, *OFTEN),
-            *("race.rivals.snapshot_every=1", "race.rivals.policy=pool", *overrides),
+            *("race.rivals.snapshot_every=1", "race.rivals.policy=pool", "race.boxes.number=2", *overrides),
         )
         assert ended.code == 0, ended.stderr
         (config,) = (tmp_path / "runs" / name).glob("*/config.yaml")
