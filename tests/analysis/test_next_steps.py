@@ -43,9 +43,9 @@ def test_a_policy_for_the_car_is_raced_as_the_car_and_exported(runs):
     config["evaluation"]["real_car"] = {"picture": {"jpeg_quality": 95}, "timing": None, "controls": None}
     (run / "config.yaml").write_text(yaml.safe_dump(config))
     first, second, *others = [line for line, _ in next_steps(run, read_object(run / "summary.json"))]
-    assert first == f"{plain[0]} evaluation=real_car"
+    assert first == f"deepracer-exp evaluate {run_word(run)} evaluation=real_car"
     assert second == f"deepracer-exp export {run_word(run)} format=car"
-    assert others == plain[1:]
+    assert [line.split()[1] for line in others] == [line.split()[1] for line in plain[1:]]
 
 
 @pytest.mark.parametrize(

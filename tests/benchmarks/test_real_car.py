@@ -92,10 +92,11 @@ def test_a_run_is_measured_under_each_condition(
     monkeypatch: pytest.MonkeyPatch, trained: Callable[..., Ended]
 ) -> None:
     camera = ("observation=camera", "collector.cars=4", "algorithm.frames_per_iteration=64")
-    run = trained(*camera, "algorithm.epochs=1", "budget.env_steps=64", "checkpoints.every=null").folder
+    short = ("algorithm.batch_size=64", "algorithm.epochs=1", "budget.env_steps=64", "checkpoints.every=null")
+    run = trained(*camera, *short).folder
     asked = real_car.protocols()
-    short = {name: replace(config, time_s=0.5, trials=1) for name, config in asked.items()}
-    monkeypatch.setattr(real_car, "protocols", lambda: short)
+    shorter = {name: replace(config, time_s=0.5, trials=1) for name, config in asked.items()}
+    monkeypatch.setattr(real_car, "protocols", lambda: shorter)
     found = real_car.measure(run)
     assert found["steps"] == 64
     assert {name for name in found if name.startswith("laps_")} == {f"laps_{name}" for name in asked}
