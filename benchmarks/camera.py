@@ -9,10 +9,12 @@
    shrinks them.
 2. `difference_of_255`: mean over pixels and channels of the absolute difference from MuJoCo's picture of four times the
    width and height with four samples a pixel, shrunk by taking means; with boxes beside the road.
-3. `real_frames` (with `--frames`): pictures of AWS's simulator on re:Invent 2018 whose poses are unknown. Colours are
-   fitted on every other frame, once for all; each of the rest is explained by the pose whose picture differs least.
-   `difference_of_255`: mean over frames of the mean absolute difference in grey; `edge_error_px`: median distance of
-   the white lines' edges in the frame from those in our picture.
+3. `real_frames` (with `--frames`): pictures of AWS's simulator on re:Invent 2018, in the order in which they were
+   taken, whose poses are unknown. Each of every other frame is explained by the pose whose picture differs least, in
+   the track's own colours (`own`), and in colours fitted on the rest of the frames (`fitted`), in grey.
+   `difference_of_255`: mean over frames of the mean absolute difference, `worst_of_255` the largest; `edge_error_px`:
+   mean distance of the white lines' edges in the frame from those in our picture, `edges_beyond_1px` the share of them
+   beyond a pixel; `wrong_places`: frames whose pose is farther from those before and after than a car can drive.
 
 MuJoCo draws with the library that `MUJOCO_GL` names; without a graphics card that is Mesa's renderer on the processor.
 """
@@ -37,7 +39,7 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.sim.camera import take_pictures
 from deepracer_exp.sim.lens import Lens
 from deepracer_exp.sim.scenery import MATERIALS, Scenery, build_scenery
-from deepracer_exp.tracks.track import Track, world_track
+from deepracer_exp.tracks.track import Track
 
 from .report import benchmark_parser, number, table, with_exit_code, write_json
 
@@ -58,6 +60,8 @@ WHITE_SHARE = 0.5
 BEGIN_SPREAD = np.array([0.15, 0.15, 0.1, 0.01, 0.01])
 """Standard deviation of the finer search at its beginning: metres and radians."""
 CANDIDATES, BEST, SEARCH_ROUNDS = 96, 12, 14
+FARTHEST_M = 1.6
+"""What a car of 4 m/s drives between two of the frames that are compared, 0.4 s: every sixth of a camera of 15 Hz."""
 
 
 def service_lens(width: int, height: int) -> Lens:
@@ -186,24 +190,38 @@ def explain_frames(folder: Path, lens: Lens) -> dict[str, Any]:
     if not files:
         raise BadInput(f"--frames {folder}: no *.png there; accepted: a folder of pictures, 160x120")
     frames = np.stack([np.asarray(Image.open(file).convert("RGB"), np.float32) @ GREY for file in files])
-    track = world_track(FRAMES_TRACK)
+    track = Track.from_config(compose_experiment([f"track={FRAMES_TRACK}"])[0].tracks[FRAMES_TRACK])
     scenery = build_scenery(track)
-    colors = floor_colors(track.floor) @ GREY
+    own = colors = floor_colors(track.floor) @ GREY
     fitted, held_out = frames[::2], frames[1::2]
     for _ in range(TURNS):
         poses = find_poses(fitted, lens, track, scenery, colors)
         colors = fit_colors(fitted, lens, scenery, poses)
-    poses = find_poses(held_out, lens, track, scenery, colors)
+    return {
+        "own": compare_frames(held_out, lens, track, scenery, own),
+        "fitted": compare_frames(held_out, lens, track, scenery, colors),
+        "frames": len(held_out),
+        **{f"grey_{name}": float(value) for name, value in zip(MATERIALS, colors, strict=True)},
+    }
+
+
+def compare_frames(
+    frames: NDArray[np.float32], lens: Lens, track: Track, scenery: Scenery, colors: NDArray[np.float32]
+) -> dict[str, Any]:
+    """Return how pictures in these greys, (materials,), differ from frames, each at the pose that explains it best."""
+    poses = find_poses(frames, lens, track, scenery, colors)
     ours = pictures(lens, scenery, poses, colors[:, None])[:, 0].astype(np.float32)
-    differences = np.abs(ours - held_out).mean(axis=(1, 2))
-    errors = [edge_errors_px(a, b, colors) for a, b in zip(held_out, ours, strict=True)]
+    differences = np.abs(ours - frames).mean(axis=(1, 2))
+    errors = np.concatenate([edge_errors_px(*pair, colors) for pair in zip(frames, ours, strict=True)])
+    moved_m = np.hypot(*np.diff(poses[:, :2], axis=0).T)
+    far = np.concatenate([[False], moved_m > FARTHEST_M, [False]])
     return {
         "difference_of_255": float(differences.mean()),
-        "edge_error_px": float(np.median(np.concatenate(errors))),
-        "frames": len(held_out),
-        "fitted": len(fitted),
+        "worst_of_255": float(differences.max()),
+        "edge_error_px": float(errors.mean()),
+        "edges_beyond_1px": float((errors > 1.0).mean()),
+        "wrong_places": int((far[:-1] & far[1:]).sum()),
         "median_pitch_deg": float(np.degrees(lens.pitch_rad + np.median(poses[:, 3]))),
-        **{f"grey_{name}": float(value) for name, value in zip(MATERIALS, colors, strict=True)},
     }
 
 
@@ -299,7 +317,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows = [(key, number(value, 2)) for key, value in summary.items() if isinstance(value, float)]
     if options.frames is not None:
         summary["real_frames"] = explain_frames(options.frames, service_lens(WIDTH, HEIGHT))
-        rows += [(f"real frames: {key}", number(value, 2)) for key, value in summary["real_frames"].items()]
+        for colors in ("own", "fitted"):
+            found = summary["real_frames"][colors]
+            rows += [
+                (f"real frames, {colors} colours: {key}", number(value, 2)) for key, value in found.items()
+            ]
     print(table(("figure", "value"), rows))
     write_json(options.json, summary)
 
