@@ -3,11 +3,10 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
-from scipy.spatial import KDTree
-from scipy.stats import norm
 
 from deepracer_exp.errors import count
 from deepracer_exp.runs.result import RunResult
@@ -275,7 +274,7 @@ def _chance(view: LogView, target_s: float | None) -> Finding | None:
     )
     values |= {"target_s": target_s, "faster": faster, "low": low, "high": high}
     if sd_s > 0:
-        normal = float(norm.cdf(target_s, mean_s, sd_s))
+        normal = NormalDist(mean_s, sd_s).cdf(target_s)
         sentence += f"; a normal fit (mean {mean_s:.2f} s, deviation {sd_s:.2f} s) says {_share(normal)}"
         values["normal"] = normal
     return Finding("chance", f"{sentence}. {share}", values)
@@ -331,11 +330,13 @@ def _costliest(view: LogView) -> Finding | None:
 def _crashes(view: LogView) -> Finding | None:
     """Say in how many finished episodes of the whole log the car crashed, and how often at one object."""
     episodes = view.episodes.loc[view.episodes["ended"], "episode"]
-    status = view.steps["episode_status"].astype(str).to_numpy()
-    rows = view.steps[(status == "crashed") & (np.append([""], status[:-1]) != "crashed")]
+    crashed_now = (view.steps["episode_status"] == "crashed").to_numpy()
+    rows = view.steps[crashed_now & ~np.append([False], crashed_now[:-1])]
     rows = rows[rows["episode"].isin(episodes)].dropna(subset=["X", "Y"])
     if not len(rows):
         return None
+    from scipy.spatial import KDTree  # takes a quarter of a second, and few cars crash
+
     places = rows[["X", "Y"]].to_numpy(np.float64)
     tree = KDTree(places)
     densest = places[tree.query_ball_point(places, CRASH_PLACE_M, return_length=True).argmax()]
@@ -356,7 +357,7 @@ def _crashes(view: LogView) -> Finding | None:
 
 def _runs_off(view: LogView) -> list[Finding]:
     late, when = view.now()
-    steps = view.steps[view.steps["episode"].isin(late["episode"])]
+    steps = view.steps.loc[view.steps["episode"].isin(late["episode"]), list(off_track.COLUMNS)]
     thresholds = {"least": off_track.LEAST, "place_m": off_track.PLACE_M}
     places = off_track_places(steps)
     if not places:

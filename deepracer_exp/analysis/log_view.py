@@ -154,12 +154,12 @@ class LogView:
         logged = int(self.steps["closest_waypoint"].max()) + 1 if len(self.steps) else 0
         return logged if self.course is None else max(len(self.course.waypoints), logged)
 
-    @property
+    @cached_property
     def is_driven(self) -> NDArray[np.bool_]:
         """Whether each row of `steps` follows an action; prepare rows do not, and have no reward."""
         return (self.steps["episode_status"] != PREPARE).to_numpy()
 
-    @property
+    @cached_property
     def episode_index(self) -> NDArray[np.intp]:
         """Position in `episodes` of the episode of each row of `steps`."""
         episode = self.steps["episode"].to_numpy()
@@ -167,11 +167,28 @@ class LogView:
 
     def driven(self, *columns: str) -> pd.DataFrame:
         """Return columns of the training's driven rows."""
-        return self._select(self.is_driven, columns)
+        kept = self._driven_columns
+        for name in columns:
+            if name not in kept:
+                kept[name] = self.steps[name].to_numpy()[self._driven_rows]
+        return pd.DataFrame({name: kept[name] for name in columns}, copy=False)
+
+    @cached_property
+    def _driven_rows(self) -> NDArray[np.intp]:
+        return np.flatnonzero(self.is_driven)
+
+    @cached_property
+    def _driven_columns(self) -> dict[str, NDArray[Any]]:
+        """Columns of the driven rows that a figure has asked for; many figures need the same ones."""
+        return {}
 
     def recent(self, *columns: str) -> pd.DataFrame:
         """Return columns of the driven rows of the last third of the iterations: of the policy as it is now."""
-        return self._select(self.is_driven & (thirds(self.steps["iteration"].to_numpy()) == 2), columns)
+        return self._select(self._is_recent, columns)
+
+    @cached_property
+    def _is_recent(self) -> NDArray[np.bool_]:
+        return self.is_driven & (thirds(self.steps["iteration"].to_numpy()) == 2)
 
     def now(self, least_laps: int = 0) -> tuple[pd.DataFrame, str]:
         """Return the finished episodes that show how the car drives now, and which they are.
@@ -202,7 +219,7 @@ class LogView:
     def _select(self, wanted: NDArray[np.bool_], columns: Sequence[str]) -> pd.DataFrame:
         # Column by column: a frame of all columns would take seconds on millions of rows.
         rows = np.flatnonzero(wanted)
-        return pd.DataFrame({name: self.steps[name].to_numpy()[rows] for name in columns})
+        return pd.DataFrame({name: self.steps[name].to_numpy()[rows] for name in columns}, copy=False)
 
 
 def thirds(iteration: NDArray[np.integer]) -> NDArray[np.intp]:

@@ -36,6 +36,12 @@ JUDGEMENTS: Mapping[str, str] = {
 }
 """Mistakes before the car leaves the road, in words."""
 
+COLUMNS = (
+    *("stream", "episode", "episode_status", "done", "all_wheels_on_track", "progress", "closest_waypoint"),
+    *("track_len", "lap_position", "offset_m", "steer", "yaw_rate_dps", "track_speed_mps", "slide_deg"),
+)
+"""Columns of the steps that are read here."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class OffTrackPlace:
@@ -67,11 +73,15 @@ def off_track_rows(steps: pd.DataFrame) -> Rows:
     """
     if not len(steps):
         return np.zeros(0, np.intp)
-    status = steps["episode_status"].astype(str).to_numpy()
-    first = first_rows(steps)
-    off = status == "off_track"
-    off[1:] &= first[1:] | (status[:-1] != "off_track")
-    ended = (status == "") & steps["done"].to_numpy(bool) & ~steps["all_wheels_on_track"].to_numpy(bool)
+    status, first = steps["episode_status"], first_rows(steps)
+    is_off = (status == "off_track").to_numpy()
+    off = is_off.copy()
+    off[1:] &= first[1:] | ~is_off[:-1]
+    ended = (
+        (status == "").to_numpy()
+        & steps["done"].to_numpy(bool)
+        & ~steps["all_wheels_on_track"].to_numpy(bool)
+    )
     return np.flatnonzero(off | (ended & (steps["progress"].to_numpy() < 100.0)))
 
 

@@ -5,7 +5,6 @@ from functools import lru_cache
 
 import numpy as np
 import shapely
-from scipy.optimize import lsq_linear
 
 from deepracer_exp.tracks.track import Track
 
@@ -63,6 +62,8 @@ def minimum_curvature_line(course: Track) -> Line:
     Moving point i sideways changes the second differences linearly; given the direction and the pace of the last
     round's line, their component across it is the curvature. So each round is a bounded linear least squares problem.
     """
+    from scipy.optimize import lsq_linear  # takes a third of a second, and few commands draw a racing line
+
     lap_position = _places(course)
     center = course.points_at(lap_position)
     first, second = _differences(course.closed, len(center))

@@ -95,10 +95,11 @@ def _curvature(course: Track, place: Values) -> Values:
     return ((after - before + np.pi) % (2 * np.pi) - np.pi) / ((high - low) * course.length_m)
 
 
-def interval_times(steps: pd.DataFrame, bounds: Values) -> pd.DataFrame:
+def interval_times(steps: pd.DataFrame, bounds: Values, wanted: Sequence[int] | None = None) -> pd.DataFrame:
     """Return the seconds each complete lap spends between places, interpolated along the lap position.
 
-    `steps` are those of a `LogView`, training or evaluations; `bounds` are lap positions (n + 1,), growing from 0 to 1.
+    `steps` are those of a `LogView`, training or evaluations; `bounds` are lap positions (n + 1,), growing from 0 to 1;
+    `wanted` are indices in `LogView.episodes`, None: all.
 
     The interval in which a lap begins is driven in two parts, at its beginning and at its end, so that the times of a
     lap always add up to its lap time.
@@ -110,6 +111,7 @@ def interval_times(steps: pd.DataFrame, bounds: Values) -> pd.DataFrame:
     end = np.append(begin[1:], len(steps))[: len(begin)] - 1
     columns = {name: steps[name].to_numpy(np.float64) for name in ("progress", "lap_position", "lap_clock_s")}
     laps = np.flatnonzero(laps_driven(steps))
+    laps = laps if wanted is None else laps[np.isin(laps, wanted)]
     begin, end = begin[laps], end[laps]
     rows = end - begin + 1
     lap = np.repeat(np.arange(len(laps)), rows)
@@ -156,6 +158,6 @@ def time_lost(steps: pd.DataFrame, lap: int, other: int) -> pd.DataFrame:
         KeyError: one of them is not a complete lap.
     """
     bounds = np.linspace(0.0, 1.0, _PLACES + 1)
-    times = interval_times(steps, bounds)
+    times = interval_times(steps, bounds, [lap, other])
     lost_s = times.loc[lap].to_numpy() - times.loc[other].to_numpy()
     return pd.DataFrame({"lap_position": bounds, "delta_s": np.r_[0.0, np.cumsum(lost_s)]})

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from scipy.stats import kendalltau
 
 from deepracer_exp.runs.result import RELIABLE
 
@@ -111,5 +110,7 @@ def _tested(name: str, iteration: np.ndarray, laps_s: Values, returns: Values) -
 
 def _rises(values: Values, chance: float) -> bool:
     """Return whether values rise with their order beyond a chance."""
+    from scipy.stats import kendalltau  # takes a second, and few trainings become slower
+
     trend = kendalltau(np.arange(len(values)), values, alternative="greater", nan_policy="omit")
     return bool(trend.pvalue < chance)

@@ -1,6 +1,8 @@
 """The steps of a recording: columns derived from them, and which rows begin an episode, a lap or a reset."""
 
+import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -56,36 +58,67 @@ def add_derived(steps: pd.DataFrame, course: Track | None, discount: float) -> p
     first = first_rows(steps)
     lap_position, offset_m, center_deg = _places(steps, first, course)
     stopped = first & ~flying_rows(steps)
-    delta_time_s, dx, dy = (_since(values, stopped) for values in (time_s, x, y))
-    delta_dist_m = np.hypot(dx, dy)
-    moving = ~stopped & (delta_dist_m >= STILL_M)
-    passed_s = np.where(delta_time_s > 0, delta_time_s, np.nan)
-    track_speed_mps = delta_dist_m / passed_s
-    change = _change(track_speed_mps, time_s, stopped)
-    turned = _wrapped(_since(yaw, stopped))
-    bearing = np.where(moving, np.degrees(np.arctan2(dy, dx)), np.nan)
-    heading = np.radians(yaw)
-    rear_dx = _since(x - FRONT_TO_REAR_AXLE_M * np.cos(heading), stopped)
-    rear_dy = _since(y - FRONT_TO_REAR_AXLE_M * np.sin(heading), stopped)
-    slide = _wrapped(np.degrees(np.arctan2(rear_dy, rear_dx)) - (yaw - turned / 2))
-    # Both are directions between two rows, because a centre line turns by up to 10 degrees at a waypoint.
-    center_turned = _wrapped(_since(center_deg, first))
-    return steps.assign(
-        lap_clock_s=_lap_clock(steps, stopped, first, delta_time_s),
-        delta_time_s=delta_time_s,
-        delta_dist_m=delta_dist_m,
-        track_speed_mps=track_speed_mps,
-        progress_speed_pps=_since(progress, first) / np.where(first, np.nan, passed_s),
-        acceleration_mps2=np.maximum(change, 0.0),
-        braking_mps2=np.maximum(-change, 0.0),
-        yaw_rate_dps=turned / passed_s,
-        true_bearing_deg=bearing,
-        slide_deg=np.where(moving & (np.hypot(rear_dx, rear_dy) >= STILL_M), slide, np.nan),
-        skew_deg=_wrapped(bearing - (center_deg - center_turned / 2)),
-        lap_position=lap_position,
-        offset_m=offset_m,
-        discounted_future_reward=_discounted(np.nan_to_num(reward), first, discount),
-    )
+    derived = dict(zip(_MOVED, _moved(x, y, yaw, time_s, progress, first, stopped, center_deg), strict=True))
+    change = _change(derived["track_speed_mps"], time_s, stopped)
+    derived |= {
+        "lap_clock_s": _lap_clock(steps, stopped, first, derived["delta_time_s"]),
+        "acceleration_mps2": np.maximum(change, 0.0),
+        "braking_mps2": np.maximum(-change, 0.0),
+        "lap_position": lap_position,
+        "offset_m": offset_m,
+        "discounted_future_reward": _discounted(np.nan_to_num(reward), first, discount),
+    }
+    return with_columns(steps, {name: derived[name] for name in DERIVED_COLUMNS})
+
+
+def with_columns(rows: pd.DataFrame, more: Mapping[str, Values]) -> pd.DataFrame:
+    """Return rows with more columns, none of which is copied, as `assign` would."""
+    columns: dict[str, Any] = {name: rows[name].array for name in rows} | dict(more)
+    return pd.DataFrame(columns, index=rows.index, copy=False)
+
+
+_MOVED = (
+    *("delta_time_s", "delta_dist_m", "track_speed_mps", "progress_speed_pps", "yaw_rate_dps"),
+    *("true_bearing_deg", "slide_deg", "skew_deg"),
+)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _moved(x, y, yaw, time_s, progress, first, stopped, center_deg):  # type: ignore[no-untyped-def]
+    """Return the columns `_MOVED` of what happened since the row before, (8, n)."""
+    out = np.full((8, len(x)), np.nan)
+    before_x = before_y = 0.0
+    for i in range(len(x)):
+        heading = math.radians(yaw[i])
+        rear_x = x[i] - FRONT_TO_REAR_AXLE_M * math.cos(heading)
+        rear_y = y[i] - FRONT_TO_REAR_AXLE_M * math.sin(heading)
+        seconds = dx = dy = turned = rear_dx = rear_dy = gained = center_turned = 0.0
+        if not stopped[i] and i > 0:
+            seconds, dx, dy = time_s[i] - time_s[i - 1], x[i] - x[i - 1], y[i] - y[i - 1]
+            turned = _wrapped(yaw[i] - yaw[i - 1])
+            rear_dx, rear_dy = rear_x - before_x, rear_y - before_y
+        if not first[i] and i > 0:
+            gained, center_turned = progress[i] - progress[i - 1], _wrapped(center_deg[i] - center_deg[i - 1])
+        before_x, before_y = rear_x, rear_y
+        dist = math.hypot(dx, dy)
+        passed = seconds if seconds > 0.0 else np.nan
+        out[0, i], out[1, i], out[2, i], out[4, i] = seconds, dist, dist / passed, turned / passed
+        if not first[i]:
+            out[3, i] = gained / passed
+        if not stopped[i] and dist >= STILL_M:
+            bearing = math.degrees(math.atan2(dy, dx))
+            out[5, i] = bearing
+            # Both are directions between two rows, because a centre line turns by up to 10 degrees at a waypoint.
+            out[7, i] = _wrapped(bearing - (center_deg[i] - center_turned / 2))
+            if math.hypot(rear_dx, rear_dy) >= STILL_M:
+                rear_deg = math.degrees(math.atan2(rear_dy, rear_dx))
+                out[6, i] = _wrapped(rear_deg - (yaw[i] - turned / 2))
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _wrapped(angle_deg):  # type: ignore[no-untyped-def]
+    return (angle_deg + 180.0) % 360.0 - 180.0
 
 
 def _lap_clock(
@@ -123,7 +156,9 @@ def timed_by_service(steps: pd.DataFrame, metrics: pd.DataFrame) -> tuple[pd.Dat
     )
     late_s = np.where(whole, known_s - steps["lap_clock_s"].to_numpy()[end], np.nan)
     moved = steps["lap_clock_s"].to_numpy() + np.repeat(np.nan_to_num(late_s), counts)
-    return steps.assign(lap_clock_s=moved), int((np.isfinite(late_s) & (resets(steps) == 0)).sum())
+    return with_columns(steps, {"lap_clock_s": moved}), int(
+        (np.isfinite(late_s) & (resets(steps) == 0)).sum()
+    )
 
 
 def _places(
@@ -141,13 +176,6 @@ def _places(
     return (start[first][np.cumsum(first) - 1] + progress / 100.0) % 1.0, unknown, unknown
 
 
-def _since(values: Values, first: NDArray[np.bool_]) -> Values:
-    """Return the differences to the rows before, 0 in first rows."""
-    since = np.diff(values, prepend=values[:1])
-    since[first] = 0.0
-    return since
-
-
 def _change(speed_mps: Values, time_s: Values, first: NDArray[np.bool_]) -> Values:
     """Return the speed's change a second between the rows before and after; 0 where one of them is missing.
 
@@ -161,10 +189,6 @@ def _change(speed_mps: Values, time_s: Values, first: NDArray[np.bool_]) -> Valu
             change[2:-1] = (speed_mps[3:] - speed_mps[1:-2]) / passed_s
         change[2:-1][first[3:] | first[2:-1] | first[1:-2]] = 0.0
     return np.nan_to_num(change, nan=0.0, posinf=0.0, neginf=0.0)
-
-
-def _wrapped(angle_deg: Values) -> Values:
-    return (angle_deg + 180.0) % 360.0 - 180.0
 
 
 @njit(cache=True, nogil=True)

@@ -181,11 +181,14 @@ def replays(offered: Sequence[Removable]) -> list[Removable]:
 def _early(item: Removable) -> Removable | None:
     """Return all of a trace but the newest tenth of its iterations and at least ten; None: it has no more.
 
-    The newest are what pages read of a trace that is too long for memory.
+    The newest are what pages read of a trace that is too long for memory. A file has the number of its last iteration.
     """
     (trace,) = item.paths
     files = sorted(path for path in trace.iterdir() if path.is_file() and not path.is_symlink())
-    early = tuple(files[: -max(len(files) // 10, _LEAST_ITERATIONS)])
+    number = {path: int(digits) for path in files if (digits := path.name.partition("-")[0]).isdigit()}
+    last = max(number.values(), default=0)
+    newest = last - max(last // 10, _LEAST_ITERATIONS)
+    early = tuple(path for path in files if path not in number or number[path] <= newest)
     if not early:
         return None
     return Removable(item.run, EARLY_TRACE, early, sum(path.lstat().st_size for path in early))

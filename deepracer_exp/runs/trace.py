@@ -1,4 +1,4 @@
-"""The files of a run's trace: one Parquet file an iteration."""
+"""The files of a run's trace: the steps of some iterations in each, Parquet."""
 
 import contextlib
 import json
@@ -7,8 +7,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from deepracer_exp.config.race import RaceConfig
@@ -27,18 +29,28 @@ _RACE: TypeAdapter[RaceConfig] = TypeAdapter(RaceConfig)
 DECIMALS = {
     **dict.fromkeys(("X", "Y", "yaw", "track_len"), 4),
     **dict.fromkeys(("steer", "throttle", "pause_duration"), 2),
-    **{"progress": 6, "tstamp": 6, "speed_mps": 3},
+    **{"progress": 5, "tstamp": 6, "speed_mps": 3},
 }
-"""Decimals that are kept: those of the service's log lines, and more of progress and time, whose differences are used.
-A reward keeps seven digits, whatever its size. Rounded, a row takes 20 bytes instead of 63."""
+"""Decimals that are kept: those of the service's log lines, and more of progress and time, whose differences are
+used. A reward keeps what `rounded_rewards` returns. Rounded, a row takes 15 bytes instead of 63."""
+_REWARD_BITS, _REWARD_DECIMAL_BITS = 16, 14
+MOST_ROWS = 2**17
+"""Steps after which a file is complete, if no checkpoint is written before: as many as fit into memory without notice,
+and enough that the description of its columns takes no share of it."""
+# A level at which zstd packs the bytes of a column by their rank: 1.5 bytes less a row than the usual one.
+_LEVELS = dict.fromkeys(("X", "Y", "yaw", "steer", "throttle", "progress", "speed_mps", "tstamp"), 11)
+_LEVELS |= {"reward": 4, "closest_waypoint": 4}
 # Columns with few repeated values are smaller and faster to write byte-split than as dictionaries.
-_SPLIT = [name for name in DECIMALS if name not in ("track_len", "pause_duration")] + ["reward"]
-_REPEATING = [name for name in TRACE_COLUMNS if name not in _SPLIT]
+_SPLIT = [*_LEVELS, "steps", "car"]
+_ENCODINGS = {**dict.fromkeys(_SPLIT, "BYTE_STREAM_SPLIT"), "episode": "DELTA_BINARY_PACKED"}
+_REPEATING = [name for name in TRACE_COLUMNS if name not in _ENCODINGS]
 
 
 def _stored(field: pa.Field) -> pa.Field:
     if field.name in DECIMALS:
-        return field.with_type(pa.decimal128(18, DECIMALS[field.name]))
+        # A number of nine digits takes four bytes; the clock of a long episode has more.
+        digits = pa.decimal64(18, 6) if field.name == "tstamp" else pa.decimal32(9, DECIMALS[field.name])
+        return field.with_type(digits)
     return field.with_type(pa.float32()) if field.name == "reward" else field
 
 
@@ -47,36 +59,57 @@ _STORED = pa.schema([_stored(field) for field in SCHEMA])
 
 
 class TraceWriter:
-    """Writes one Parquet file an iteration, atomically."""
+    """Writes the steps of consecutive iterations into one Parquet file after the other, each atomically.
+
+    A file has the number of its last iteration, `00012-iteration.parquet`. It is complete when it has `MOST_ROWS`, or
+    when `flush` is called: before each checkpoint from which the run can be resumed, so that no file has steps of
+    before and after it.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self._iteration = self._rows = 0
+        self._steps: list[pa.Table] = []
+        self._others: list[pa.Table] = []
 
-    def write(self, iteration: int, table: pa.Table) -> Path:
-        """Write the rows of one iteration and return the file, `00012-iteration.parquet`.
-
-        Raises:
-            RunFailed: the file cannot be written (disk full, folder read-only).
-        """
-        return self._write(
-            f"{iteration:05d}{_ENDING}",
-            table.cast(_STORED),
-            use_dictionary=_REPEATING,
-            column_encoding=dict.fromkeys(_SPLIT, "BYTE_STREAM_SPLIT"),
-            store_decimal_as_integer=True,
-            write_statistics=False,
-        )
-
-    def write_others(self, iteration: int, table: pa.Table) -> Path:
-        """Write `placement.placements_table` of an iteration and return the file, `00012-others.parquet`.
+    def add(self, iteration: int, steps: pa.Table, others: pa.Table | None = None) -> None:
+        """Add the rows of an iteration, and `placement.placements_table` where there are boxes or bots.
 
         Raises:
-            RunFailed: the file cannot be written.
+            RunFailed: a file is complete and cannot be written (disk full, folder read-only).
         """
-        return self._write(f"{iteration:05d}{_OTHERS_ENDING}", table)
+        place = steps.column_names.index("reward")
+        rewards = pa.array(rounded_rewards(steps["reward"].to_numpy()))
+        rounded = steps.set_column(place, "reward", rewards).cast(_STORED)
+        self._steps.append(rounded)
+        if others is not None:
+            self._others.append(others)
+        self._iteration, self._rows = iteration, self._rows + len(steps)
+        if self._rows >= MOST_ROWS:
+            self.flush()
 
-    def _write(self, name: str, table: pa.Table, **how: Any) -> Path:
-        path = self.folder / name
+    def flush(self) -> None:
+        """Write what was added since the file before.
+
+        Raises:
+            RunFailed: a file cannot be written.
+        """
+        steps, others, self._steps, self._others, self._rows = self._steps, self._others, [], [], 0
+        if steps:
+            self._write(
+                _ENDING,
+                pa.concat_tables(steps).unify_dictionaries().combine_chunks(),
+                use_dictionary=_REPEATING,
+                column_encoding=_ENCODINGS,
+                compression_level=_LEVELS,
+                store_decimal_as_integer=True,
+                write_statistics=False,
+            )
+        if others:
+            self._write(_OTHERS_ENDING, pa.concat_tables(others))
+
+    def _write(self, ending: str, table: pa.Table, **how: Any) -> None:
+        path = self.folder / f"{self._iteration:05d}{ending}"
         unfinished = path.with_name(f".{path.name}")
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -87,7 +120,19 @@ class TraceWriter:
             with contextlib.suppress(OSError):
                 unfinished.unlink(missing_ok=True)
             raise RunFailed(f"{path}: the trace cannot be written: {error.strerror or error}") from error
-        return path
+
+
+def rounded_rewards(reward: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return rewards with five digits, and with the four decimals of the service's log lines.
+
+    Their last bits are 0: the error is at most 2^-17 of a reward, and at most half of the fourth decimal up to 512,
+    from where all bits of float32 are kept.
+    """
+    bits = reward.astype(np.float32).view(np.int32)
+    exponent = (bits >> 23 & 0xFF) - 127
+    dropped = np.minimum(23 - _REWARD_BITS, np.maximum(23 - _REWARD_DECIMAL_BITS - exponent, 0))
+    half = (1 << dropped) >> 1
+    return ((bits + half) >> dropped << dropped).view(np.float32)
 
 
 def trace_files(folder: Path) -> list[Path]:

@@ -10,9 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
-from scipy.optimize import lsq_linear, minimize
-from scipy.sparse import block_diag, csr_array, diags_array, vstack
 
 from .track import Track
 
@@ -89,6 +86,9 @@ class _Road:
         inner, outer = (_between(line, places) for line in (track.inner, track.outer))
         self._middle, self._half = 0.5 * (outer + inner), 0.5 * (outer - inner)
         self._reach = 1.0 + reach_m / np.maximum(np.hypot(*self._half.T), 1e-6)
+        # What is imported from scipy here takes half a second, and few commands search a line.
+        from scipy.interpolate import CubicSpline
+
         self._start = None if start_ndist is None else track.points_at(np.array([start_ndist]))[0]
         self._knots = np.round(np.linspace(0, count, max(8, round(track.length_m / _KNOT_M)) + 1)).astype(int)
         self._basis = CubicSpline(self._knots, np.eye(len(self._knots)), bc_type="natural")(
@@ -116,6 +116,8 @@ class _Road:
 
     def improved(self, offsets: Floats) -> tuple[float, Floats]:
         """Return the least time on a line near by, and its offsets."""
+        from scipy.optimize import minimize
+
         result = minimize(
             lambda moved: self.time_s(offsets + self._basis @ moved),
             np.zeros(len(self._knots)),
@@ -134,6 +136,13 @@ class _Road:
 
     def simple_lines(self) -> list[Floats]:
         """Return lines between the shortest and the straightest, as offsets."""
+        from scipy.optimize import lsq_linear
+        from scipy.sparse import block_diag, csr_array, diags_array, vstack
+
+        def both(matrix: csr_array) -> csr_array:
+            """Return a matrix that does the same to x and y."""
+            return block_diag([matrix, matrix]).tocsr()
+
         middle, half = self._middle, self._half
         count = len(middle)
         ahead = diags_array([-np.ones(count), np.ones(count - 1), [1.0]], offsets=[0, 1, 1 - count]).tocsr()
@@ -141,7 +150,7 @@ class _Road:
             ahead = ahead[:-1]
         # On an even grid, differences are lengths and second differences curvature.
         spread = vstack([diags_array(half[:, 0]), diags_array(half[:, 1])]).tocsr()
-        step, bend = _both(ahead), _both((ahead.T @ ahead).tocsr())
+        step, bend = both(ahead), both((ahead.T @ ahead).tocsr())
         lines = []
         for weight in _STRAIGHTNESS:
             matrix = vstack([step @ spread, weight * (bend @ spread)]).tocsr()
@@ -156,11 +165,6 @@ class _Road:
 
 def _between(line: Floats, places: Floats) -> Floats:
     return np.stack([np.interp(places, np.arange(len(line)), line[:, axis]) for axis in (0, 1)], axis=1)
-
-
-def _both(matrix: csr_array) -> csr_array:
-    """Return a matrix that does the same to x and y."""
-    return block_diag([matrix, matrix]).tocsr()
 
 
 @njit(cache=True)

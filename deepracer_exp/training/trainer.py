@@ -217,9 +217,8 @@ class Trainer:
     def _write_trace(self, rows: NDArray[np.float64]) -> None:
         """Write the steps of an iteration, and where the others around them were."""
         extra, rows = rows[:, len(PACKED) :], rows[:, : len(PACKED)]
-        self._trace.write(self.iteration, to_table(rows, self.iteration, self.metrics.track_names))
-        if extra.shape[1]:
-            self._trace.write_others(self.iteration, placements_table(self.setup, rows, extra))
+        others = placements_table(self.setup, rows, extra) if extra.shape[1] else None
+        self._trace.add(self.iteration, to_table(rows, self.iteration, self.metrics.track_names), others)
 
     def request_save(self) -> None:
         """Write a checkpoint after this iteration."""
@@ -251,6 +250,7 @@ class Trainer:
         if self.rivals is not None:
             state |= self.rivals.state_dict()
         state |= self.best.state_dict()
+        self._trace.flush()
         self.checkpoints.save(self.agent, self.counters(), state, best=best)
         if collector is not None:
             self.saved_steps = self.env_steps
@@ -307,8 +307,9 @@ class Trainer:
         summary["best"] = self.best.record
         logger.log(logging.ERROR if error else logging.INFO, "%s", ending, exc_info=error)
         try:
+            self._trace.flush()
             self.folder.write(SUMMARY, json.dumps(summary, indent=2) + "\n")
-        except OSError:
+        except (OSError, RunFailed):
             if ending.status != FAILED:
                 raise
         result = TrainResult(ending, exit_code, self.folder.path, summary, error)

@@ -83,8 +83,8 @@ def test_a_runs_own_reward_is_paid_again_in_every_row(tmp_path, monkeypatch, ove
 def test_the_decimals_of_a_trace_are_enough_to_pay_a_reward_again(trained):
     run = trained("reward=progress_delta", "budget.iterations=2").folder
     replayed = replay_reward(prepare(read_run_recording(run)), "progress_delta")
-    # A step's gain is known to 1e-6% of a lap of 17.7 m, the recorded reward to seven digits.
-    np.testing.assert_allclose(replayed.steps["new_reward"], replayed.steps["reward"], rtol=1e-6, atol=4e-7)
+    # A step's gain is known to 1e-5% of a lap of 17.7 m, the recorded reward to five digits.
+    np.testing.assert_allclose(replayed.steps["new_reward"], replayed.steps["reward"], rtol=1e-5, atol=4e-6)
 
 
 def test_step_by_step_and_all_at_once_pay_the_same(own, reward):

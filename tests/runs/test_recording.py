@@ -4,6 +4,9 @@ import shutil
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
 import pytest
 
 from deepracer_exp.aws.logs.recording import (
@@ -27,8 +30,16 @@ def kinds(table) -> dict[str, str]:
 
 @pytest.fixture
 def folder(copied):
-    """Return a copy of a run's folder that may be spoilt."""
-    return copied()
+    """Return a copy of a run's folder that may be spoilt, with a file of its trace for each iteration."""
+    folder = copied()
+    files = sorted((folder / "trace").iterdir())
+    whole = pa.concat_tables([pq.read_table(file) for file in files])
+    for file in files:
+        file.unlink()
+    for iteration in (1, 2, 3, 4):
+        rows = whole.filter(pc.equal(whole["iteration"], iteration))
+        pq.write_table(rows, folder / "trace" / f"{iteration:05d}-iteration.parquet")
+    return folder
 
 
 def test_the_steps_are_the_rows_of_the_trace(trained):

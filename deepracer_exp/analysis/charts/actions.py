@@ -1,6 +1,7 @@
 """The actions that the car takes, and the places where it takes them."""
 
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import pandas as pd
@@ -50,9 +51,14 @@ class ActionClasses:
     """Whether classes are ranges of a continuous action space."""
 
 
+_SORTED: WeakKeyDictionary[LogView, ActionClasses | None] = WeakKeyDictionary()
+
+
 def action_classes(view: LogView) -> ActionClasses | None:
-    """Sort the training's actions into classes; None if none is logged."""
-    return classify(view.driven(*COLUMNS))
+    """Sort the training's actions into classes, once for all figures; None if none is logged."""
+    if view not in _SORTED:
+        _SORTED[view] = classify(view.driven(*COLUMNS))
+    return _SORTED[view]
 
 
 def classify(rows: pd.DataFrame) -> ActionClasses | None:
@@ -64,8 +70,12 @@ def classify(rows: pd.DataFrame) -> ActionClasses | None:
     action = rows["action"].to_numpy(np.float64)
     listed = pd.unique(action[logged])
     continuous = bool(not np.isfinite(listed).all() or len(listed) > MOST_CLASSES)
-    key = _ranges(steer, speed) if continuous else action
-    groups = pd.DataFrame({"steer": steer, "speed": speed})[logged].groupby(key[logged]).mean()
+    key = np.where(logged, _ranges(steer, speed) if continuous else action, np.nan)
+    code, listed = pd.factorize(key, sort=True)  # -1 where nothing is logged
+    groups = pd.DataFrame(
+        {name: means(code, values, len(listed)) for name, values in (("steer", steer), ("speed", speed))},
+        index=listed,
+    )
     if continuous:
         both = [f"{side}, {pace}" for side in STEERING_NAMES for pace in SPEED_NAMES]
         names = [both[int(k)] for k in groups.index]
@@ -77,7 +87,7 @@ def classify(rows: pd.DataFrame) -> ActionClasses | None:
         names = [f"{_angle(group.steer)} {group.speed:.2g} m/s" for group in groups.itertuples()]
     return ActionClasses(
         rows=rows,
-        number=groups.index.get_indexer(np.where(logged, key, np.nan)),
+        number=np.append(groups.index.get_indexer(listed), -1)[code],
         names=tuple(names),
         steering_deg=groups["steer"].to_numpy(),
         continuous=continuous,

@@ -2,22 +2,23 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
+from statistics import NormalDist
 
 import numpy as np
 import pandas as pd
 from numpy.polynomial import Polynomial
-from scipy.stats import norm
 
 from deepracer_exp.analysis.log_view import LEAST_LAPS, LogView, thirds
 from deepracer_exp.analysis.sectors import Sector, sectors_of, time_lost
-from deepracer_exp.analysis.statistics import Values, histogram, subsample
+from deepracer_exp.analysis.statistics import Values, histogram, means, subsample
 from deepracer_exp.errors import count
 
 from .figure import Chart, Layer, Panel, bars, colored_points, in_rows, line, mark, points
 from .style import BLUE, FAINT, GREEN, ORANGE, PALE, SKY, VERMILION
 from .training import ITERATION
 
-CHANCES = {-2: float(norm.cdf(-2)), -3: float(norm.cdf(-3))}
+CHANCES = {deviations: NormalDist().cdf(deviations) for deviations in (-2, -3)}
 """Chance of a value so many standard deviations below the mean of a normal distribution: 2.275 and 0.135 per cent."""
 LAP_COLUMNS: Mapping[str, str] = {
     "dist_m": "distance driven, m",
@@ -71,7 +72,8 @@ def _histogram_panel(title: str, times_s: Values) -> Panel:
     marks = [(mean, f"mean {mean:.2f} s", BLUE), (best, f"best {best:.2f} s", GREEN)]
     if deviation > 0:
         span = np.linspace(min(best, mean - 3.5 * deviation), mean + 3.5 * deviation, 120)
-        expected = len(times_s) * bins.width * norm.pdf(span, mean, deviation)
+        density = np.exp(-(((span - mean) / deviation) ** 2) / 2) / (deviation * np.sqrt(2 * np.pi))
+        expected = len(times_s) * bins.width * density
         layers.append(line(span, expected, FAINT, "normal distribution", width=1.5))
         for times, color in ((-2, ORANGE), (-3, VERMILION)):
             position = mean + times * deviation
@@ -268,32 +270,34 @@ def correlations(view: LogView) -> Chart | None:
 def _lap_columns(view: LogView) -> pd.DataFrame:
     """Return `lap_time_s` and `LAP_COLUMNS` of each complete lap."""
     number = view.episode_index
-    rows = view.episodes["lap_time_s"].notna().to_numpy()[number]
+    rows = np.flatnonzero(view.episodes["lap_time_s"].notna().to_numpy()[number])
     lap = number[rows]
+    begin = np.flatnonzero(np.diff(lap, prepend=-1))
+    count = np.diff(np.append(begin, len(lap)))
+    end, place = begin + count - 1, np.repeat(np.arange(len(begin)), count)
     columns = ["steer", "reward", "track_speed_mps", "progress_speed_pps", "slide_deg", "offset_m"]
-    part = view.steps.loc[rows, [*columns, "lap_position", "progress"]]
-    part = part.assign(
-        changed=part["steer"].diff().abs().where(np.diff(lap, prepend=-1) == 0),
-        slide=part["slide_deg"].abs(),
-        beside=part["offset_m"].abs(),
-        # The eighth row stands for half a second after the start.
-        started=part["track_speed_mps"].where(part.groupby(lap).cumcount() == 7),
-    )
-    groups = part.groupby(lap)
+    part = {
+        name: view.steps[name].to_numpy(np.float64)[rows] for name in (*columns, "lap_position", "progress")
+    }
+    changed = np.abs(np.diff(part["steer"], prepend=np.nan))
+    changed[begin] = np.nan
+    # The eighth row stands for half a second after the start.
+    started = np.where(count > 7, part["track_speed_mps"][np.minimum(begin + 7, end)], np.nan)
+    mean = partial(means, place, n=len(begin))
     per_lap = pd.DataFrame(
         {
-            "speed_mean_mps": groups["track_speed_mps"].mean(),
-            "speed_top_mps": groups["track_speed_mps"].max(),
-            "progress_top_pps": groups["progress_speed_pps"].max(),
-            "reward_step": groups["reward"].mean(),
-            "reward_last": groups["reward"].last(),
-            "steer_change_deg": groups["changed"].mean(),
-            "slide_top_deg": groups["slide"].quantile(0.95),
-            "offset_mean_m": groups["beside"].mean(),
-            "start_speed_mps": groups["started"].max(),
-            "start": 100.0 * ((groups["lap_position"].first() - groups["progress"].first() / 100.0) % 1.0),
+            "speed_mean_mps": mean(part["track_speed_mps"]),
+            "speed_top_mps": np.fmax.reduceat(part["track_speed_mps"], begin),
+            "progress_top_pps": np.fmax.reduceat(part["progress_speed_pps"], begin),
+            "reward_step": mean(part["reward"]),
+            "reward_last": part["reward"][end],
+            "steer_change_deg": mean(changed),
+            "slide_top_deg": pd.Series(np.abs(part["slide_deg"])).groupby(place).quantile(0.95),
+            "offset_mean_m": mean(np.abs(part["offset_m"])),
+            "start_speed_mps": started,
+            "start": 100.0 * ((part["lap_position"][begin] - part["progress"][begin] / 100.0) % 1.0),
         }
-    )
+    ).set_axis(lap[begin])
     summed = view.episodes.loc[per_lap.index, ["lap_time_s", "dist_m", "reward", "iteration"]]
     return summed.join(per_lap)[["lap_time_s", *LAP_COLUMNS]]
 

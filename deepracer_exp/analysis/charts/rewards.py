@@ -5,7 +5,14 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from deepracer_exp.analysis.log_view import LogView, closest_waypoints, thirds
-from deepracer_exp.analysis.statistics import MOST_ROWS, histogram, means, quantiles, subsample
+from deepracer_exp.analysis.statistics import (
+    MOST_ROWS,
+    histogram,
+    lowest_and_highest,
+    means,
+    quantiles,
+    subsample,
+)
 
 from .actions import action_classes
 from .figure import Chart, Layer, Panel, band, bars, color_range, in_rows, line, mark, points
@@ -111,15 +118,15 @@ def reward_by_waypoint(view: LogView) -> Chart | None:
     ):
         values = rows[column].to_numpy(np.float64)
         quarter, median, three_quarters = quantiles(waypoint[part], values[part], n, (0.25, 0.5, 0.75))
-        ends = pd.Series(values).groupby(waypoint).agg(["max", "min"]).reindex(range(n))
+        worst, best = lowest_and_highest(waypoint, values, n)
         usual: list[Layer] = [
             band(waypoints, quarter, three_quarters, BLUE, "middle half"),
             line(waypoints, means(waypoint, values, n), INK, "mean", width=2.5),
             line(waypoints, median, ORANGE, "median", dashed=True, width=2.5),
         ]
         extremes = [
-            line(waypoints, ends["max"], GREEN, "best"),
-            line(waypoints, ends["min"], VERMILION, "worst"),
+            line(waypoints, best, GREEN, "best"),
+            line(waypoints, worst, VERMILION, "worst"),
         ]
         panels += [waypoint_panel(usual, label, n), waypoint_panel(extremes, label, n)]
     return Chart(
@@ -174,7 +181,7 @@ def reward_distribution(view: LogView) -> Chart | None:
     episodes = view.episodes[view.episodes["ended"]]
     if not len(rewards) or not len(episodes):
         return None
-    low, high = np.percentile(rewards, [0.1, 99.9])
+    low, median, most, high = np.percentile(rewards, [0.1, 50.0, 90.0, 99.9])
     inside = rewards[(rewards >= low) & (rewards <= high)]
     steps = histogram(inside, least=20)
     sums, complete = episodes["reward"].to_numpy(np.float64), episodes["complete"].to_numpy(bool)
@@ -191,8 +198,8 @@ def reward_distribution(view: LogView) -> Chart | None:
     return Chart(
         name="reward_distribution",
         title="Rewards of steps and of episodes",
-        caption=f"Half of the steps earn at least {np.median(rewards):.3g}, one in ten at least "
-        f"{np.percentile(rewards, 90):.3g}. If complete laps do not clearly earn more than other episodes, the reward "
+        caption=f"Half of the steps earn at least {median:.3g}, one in ten at least {most:.3g}. If complete laps do "
+        "not clearly earn more than other episodes, the reward "
         f"does not ask for laps.{left_out}",
         rows=[
             [

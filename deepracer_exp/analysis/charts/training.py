@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from deepracer_exp.analysis.log_view import LogView
-from deepracer_exp.analysis.statistics import histogram, moving_average, quantiles, subsample
+from deepracer_exp.analysis.statistics import MOST_ROWS, histogram, moving_average, quantiles, subsample
 from deepracer_exp.stopping.judge import convergence
 
 from .figure import Chart, Layer, Panel, band, bars, in_rows, line, mark, points
@@ -197,13 +197,15 @@ def evaluations(view: LogView) -> Chart | None:
 
 def stability(view: LogView) -> Chart | None:
     """Draw how regular the control steps were and how much the results of the episodes scatter."""
-    driven = view.steps[view.steps["delta_time_s"] > 0]
-    if not len(driven):
+    times_ms = 1000 * view.steps["delta_time_s"].to_numpy(np.float64)
+    iteration = view.steps["iteration"].to_numpy()[times_ms > 0]
+    times_ms = times_ms[times_ms > 0]
+    if not len(times_ms):
         return None
-    times_ms = 1000 * driven["delta_time_s"].to_numpy(np.float64)
     lengths = histogram(np.minimum(times_ms, np.percentile(times_ms, 99.9)), least=20)
     count = int(view.steps["iteration"].max()) + 1
-    high, middle = quantiles(driven["iteration"].to_numpy(), times_ms, count, (0.95, 0.5))
+    part = subsample(len(times_ms), MOST_ROWS)
+    high, middle = quantiles(iteration[part], times_ms[part], count, (0.95, 0.5))
     measured = np.flatnonzero(np.isfinite(middle))
     panels = [
         Panel(
