@@ -67,7 +67,9 @@ def findings(view: LogView, target_s: float | None = None) -> list[Finding]:
     if view.trained:
         overfits = _overfits(view)
         results += [_converged(view, overfits), _submit(view), _laps_slower(view)]
-    results += [_chance(view, target_s), _time_lost(view), _crashes(view), _costliest(view), *_runs_off(view)]
+    results += [_chance(view, target_s), _time_lost(view)]
+    if not view.laps_only:
+        results += [_crashes(view), _costliest(view), *_runs_off(view)]
     results += [_zigzag(view), overfits]
     return [finding for finding in results if finding is not None]
 
@@ -257,6 +259,8 @@ def _chance(view: LogView, target_s: float | None) -> Finding | None:
         return Finding("chance", sentence, {"laps": laps, "best_s": best_s}, {"least_laps": LEAST_LAPS})
     complete, sd_s = laps / len(episodes), float(laps_s.std(ddof=1))
     share = f"{complete:.0%} of the episodes were complete laps."
+    if view.laps_only:
+        share = "Other episodes are not in the trace (trace=laps)."
     driven = count(laps, f"complete {view.lap_word}")
     values: _Numbers = {"laps": laps, "best_s": best_s, "mean_s": mean_s, "complete": complete, "sd_s": sd_s}
     if target_s is None:

@@ -101,6 +101,11 @@ class LogView:
         return poses[..., :2]
 
     @property
+    def laps_only(self) -> bool:
+        """Whether the steps are those of complete laps, so that nothing is known of where others ended."""
+        return self.run is not None and self.run.counted is not None
+
+    @property
     def stopping(self) -> Mapping[str, Any] | None:
         """The group `stopping` of a run of ours."""
         return None if self.run is None else self.run.stopping
@@ -276,6 +281,9 @@ def prepare(log: Recording | RunRecording | EvaluationRecording, track: str | No
     raced = raced.assign(stream=driven["stream"].to_numpy()[first_rows(driven)])
     evaluations = None if run is None else run.evaluations
     iterations = judged = iteration_table(recording, trained, episodes, evaluations=evaluations)
+    if run is not None and run.counted is not None:
+        counted = run.counted.set_index("iteration").reindex(iterations["iteration"])
+        iterations = judged = iterations.assign(**{name: counted[name].to_numpy() for name in counted})
     usual = iterations["episodes"][iterations["episodes"] > 0].median()
     if run is None and usual < LEAST_EPISODES:
         judged = iteration_table(recording, trained, episodes, LEAST_EPISODES)

@@ -95,6 +95,8 @@ def lowest_and_highest(place, values, n):  # type: ignore[no-untyped-def]
 
 def quantiles(place: NDArray[np.intp], values: ArrayLike, n: int, shares: tuple[float, ...]) -> Values:
     """Return quantiles (len(shares), n) of the values at each of n places; NaN where none is known."""
+    if not len(place):
+        return np.full((len(shares), n), np.nan)
     groups = pd.Series(np.asarray(values, np.float64)).groupby(place)
     return groups.quantile(list(shares)).unstack().reindex(range(n)).to_numpy().T
 

@@ -2,9 +2,9 @@
 
 import re
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from .car import CarConfig
 from .driving import ActionSpaceConfig, EpisodeConfig, ObservationConfig, RandomizationConfig, RewardConfig
@@ -47,6 +47,11 @@ def _device(name: str) -> str:
     return name
 
 
+def _off(kept: object) -> object:
+    """Take YAML's `off`, which is false there, as the word."""
+    return "off" if kept is False else kept
+
+
 @dataclass(frozen=True, kw_only=True)
 class Experiment:
     """Everything that defines a run."""
@@ -75,6 +80,7 @@ class Experiment:
     teacher: Annotated[str, Field(min_length=1)] | None = None
     race: RaceConfig = ALONE
     device: Annotated[str, AfterValidator(_device)] = "cpu"
+    trace: Annotated[Literal["full", "laps", "off"], BeforeValidator(_off)] = "full"
 
     def __post_init__(self) -> None:
         """Refuse groups that contradict each other, such as a network that cannot read what is observed."""

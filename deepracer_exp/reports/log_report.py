@@ -40,6 +40,8 @@ from .page import Glimpse, Plot, plot_of, render
 
 MOST_FILES = 400
 _BESIDE, _REWARDED = "Generations and tracks", "What the reward function rewards"
+_OF_FAILURES = ("What is on the road", "Where it goes wrong")
+"""Sections on episodes that were no complete lap."""
 _PICTURE = "lap_line"
 """The figure beside the outcome."""
 SECTIONS: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
@@ -132,7 +134,11 @@ def draw_sections(page: LogPage) -> dict[str, list[Chart]]:
     if page.replay is not None:
         drawn["Another reward function"] = [*page.replay.charts]
     sections = SECTIONS if view.trained else RACES
-    drawn |= {title: [draw_one(view) for draw_one in some] for title, some in sections.items()}
+    unknown = _OF_FAILURES if view.laps_only else ()
+    drawn |= {
+        title: [draw_one(view) for draw_one in some] if title not in unknown else []
+        for title, some in sections.items()
+    }
     drawn[_BESIDE] += [generations([view]), generalisation_matrix([policy_of(view)])]
     if page.terms is not None:
         drawn[_REWARDED].append(rewards.reward_terms(view, page.terms))

@@ -13,14 +13,17 @@ from deepracer_exp.config.race import RaceConfig
 from deepracer_exp.env.placement import box_corners_of, read_placements
 from deepracer_exp.env.setup import Course
 from deepracer_exp.runs.files import BEST_LAP, LEARNING, METRICS, REPORT, TRACE, read_config, sees_pictures
-from deepracer_exp.runs.trace import read_others, read_trace
+from deepracer_exp.runs.trace import has_trace, missing_trace, read_others, read_trace
 from deepracer_exp.tracks.track import Track
 
 logger = logging.getLogger("deepracer_exp")
 
 
 def write_pictures(run_dir: Path, courses: Sequence[Course]) -> None:
-    """Draw `best_lap.png` and `learning.png` from the run's trace and metrics, if it has an iteration."""
+    """Draw `best_lap.png` and `learning.png` from the run's trace and metrics, if it has an iteration.
+
+    Without a trace (`trace=off`, or no lap yet with `trace=laps`) there is no best_lap.png.
+    """
     # Imported here: it takes half a second, which the start of a training need not wait for.
     import pandas as pd
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -30,7 +33,7 @@ def write_pictures(run_dir: Path, courses: Sequence[Course]) -> None:
     metrics_file = run_dir / METRICS
     if not metrics_file.is_file() or not metrics_file.stat().st_size:
         return
-    trace = read_trace(run_dir / TRACE, LINE_COLUMNS)
+    trace = read_trace(run_dir / TRACE, LINE_COLUMNS) if has_trace(run_dir / TRACE) else None
     tracks = {course.name: course.tracks[0] for course in courses}
     others = read_others(run_dir / TRACE)
     boxes_of = None
@@ -42,15 +45,19 @@ def write_pictures(run_dir: Path, courses: Sequence[Course]) -> None:
             drawn = placed[track.reversed].get(episode)
             return np.zeros((0, 4, 2)) if drawn is None else box_corners_of(race, track, drawn)
 
-    curves = learning_curves(pd.read_json(metrics_file, lines=True))
-    for name, figure in ((BEST_LAP, driven_lines(trace, tracks, boxes_of)), (LEARNING, curves)):
+    figures = {LEARNING: learning_curves(pd.read_json(metrics_file, lines=True))}
+    if trace is not None:
+        figures[BEST_LAP] = driven_lines(trace, tracks, boxes_of)
+    for name, figure in figures.items():
         figure.set_dpi(120)
         # `savefig` draws a figure twice, the first time for its layout alone.
         FigureCanvasAgg(figure).print_png(run_dir / name)
 
 
 def write_run_page(run_dir: Path, car: CarConfig) -> str | None:
-    """Write `report.html`; return a line if that fails: no error here ends a training."""
+    """Write `report.html`; return a line if there is no trace or that fails: no error here ends a training."""
+    if not has_trace(run_dir / TRACE):
+        return f"no {REPORT}, no {BEST_LAP}: the run {missing_trace(run_dir)}"
     try:
         from deepracer_exp.analysis.findings import findings
         from deepracer_exp.analysis.log_view import prepare

@@ -21,6 +21,7 @@ HARMLESS = (
     "tracking",
     "debug",
     "report",
+    "trace",
 )
 """Keys, or their first parts, that change nothing of what a run learns. `runs_dir` is where the run is found."""
 _MEASURED_BY = "stopping.episodes"

@@ -35,7 +35,7 @@ from deepracer_exp.errors import BadInput
 
 from .files import CONFIG, METRICS, REWARD, SUMMARY, TRACE, is_run, read_config, read_object
 from .result import IN_TRAINING, RunResult, read_result
-from .trace import read_evaluation_others, read_others, trace_files
+from .trace import missing_trace, read_evaluation_others, read_others, trace_files
 
 CONTROL_PERIOD_S = 1 / 15
 """The service's simulated seconds of a control step."""
@@ -57,6 +57,18 @@ EVALUATION_COLUMNS: Mapping[str, tuple[str, str]] = {
     "zigzag_lost_s": ("float64", "s a lap lost in these; NaN where not measured"),
 }
 """Columns of `Recording.evaluations`: type and meaning with unit."""
+COUNTED_COLUMNS: Mapping[str, tuple[str, str]] = {
+    "iteration": ("int32", "policy update that used the steps"),
+    "episodes": ("int64", "that ended in it"),
+    "complete": ("int64", "episodes that completed the lap"),
+    "completion_mean": ("float64", "per cent of the lap, mean over episodes; NaN where none ended"),
+    "lap_share": ("float64", "share of episodes that completed the lap, 0 to 1"),
+    "reward_mean": ("float64", "mean of the episodes' sums"),
+}
+"""Columns of `RunRecording.counted`: type and meaning with unit."""
+LAPS_ONLY = (
+    "trace=laps: has complete laps only; figures of places, actions and rewards leave out all other episodes"
+)
 
 _READ = [name for name in STEP_COLUMNS if name in SCHEMA.names]
 _SCHEMA = pa.schema([SCHEMA.field(name) for name in _READ])
@@ -78,6 +90,8 @@ class RunRecording:
     """The run's group `stopping`; None where its configuration cannot be read."""
     decision: Mapping[str, Any] | None = None
     """The decision of the stopping rule that ended the run, as in summary.json; None if no rule did."""
+    counted: pd.DataFrame | None = None
+    """Results of all episodes by iteration, `COUNTED_COLUMNS`, where the trace has complete laps only."""
     others: PlacedOthers | None = None
     """The others on the road; None where the car was alone, or they are not known."""
 
@@ -102,11 +116,7 @@ def read_log(path: Path) -> Recording | RunRecording | EvaluationRecording:
         BadInput: nothing is there, or nothing of it can be read.
     """
     if is_run(path) and not (path / TRACE).is_dir():
-        raise BadInput(
-            path,
-            "has no trace: `deepracer-exp runs clean` removed it, or the run never drove",
-            "a run with its trace, or logs of the service",
-        )
+        raise BadInput(path, missing_trace(path), "a run with its trace, or logs of the service")
     if is_traced_run(path):
         return read_run_recording(path)
     others = read_evaluation_others(path)
@@ -128,7 +138,9 @@ def read_run_recording(folder: Path) -> RunRecording:
     files: list[Path] = []
     steps = _steps(folder, problems, files)
     config = _config(folder, problems, files)
-    updates, evaluated = _metrics(folder, problems, files)
+    updates, evaluated, counted = _metrics(folder, problems, files)
+    if laps_only := config.get("trace") == "laps":
+        problems.append(LogProblem(str(folder / TRACE), None, LAPS_ONLY))
     best = _best(folder, problems)
     recording = Recording(
         name=folder.resolve().name,
@@ -148,6 +160,7 @@ def read_run_recording(folder: Path) -> RunRecording:
         evaluations=evaluated,
         stopping=config.get("stopping"),
         decision=_decision(folder),
+        counted=counted if laps_only else None,
         others=_others(folder, config, problems),
     )
 
@@ -204,10 +217,11 @@ def _config(folder: Path, problems: list[LogProblem], files: list[Path]) -> Mapp
 
 def _metrics(
     folder: Path, problems: list[LogProblem], files: list[Path]
-) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return updates and evaluations."""
+) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
+    """Return updates, evaluations, and the results of the episodes (`COUNTED_COLUMNS`)."""
     file = folder / METRICS
-    updates, evaluated = [], []
+    updates, evaluated, counted = [], [], []
+    episodes = laps = 0
     for number, line in enumerate(_text(file, problems, files).splitlines(), start=1):
         try:
             row = json.loads(line)
@@ -218,13 +232,27 @@ def _metrics(
             names = [name for name in EVALUATION_COLUMNS if name not in ("iteration", "held_out_completion")]
             tried = {name: _number(row.get(f"eval_{name}")) for name in names}
             tried["held_out_completion"] = _number(row.get("held_out_completion"))
+            ended, complete = int(row["episodes"]) - episodes, int(row["laps"]) - laps
+            episodes, laps = int(row["episodes"]), int(row["laps"])
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             problems.append(LogProblem(str(file), number, f"left out: {_one_line(error)}"))
             continue
         updates.append({"iteration": iteration, "epoch": 0, **losses})
+        counted.append(
+            {
+                **{"iteration": iteration, "episodes": ended, "complete": complete},
+                "completion_mean": _number(row.get("completion")),
+                "lap_share": complete / ended if ended else math.nan,
+                "reward_mean": _number(row.get("mean_return")),
+            }
+        )
         if np.isfinite(tried["completion"]):
             evaluated.append({"iteration": iteration, **tried})
-    return typed_table(UPDATE_COLUMNS, updates), typed_table(EVALUATION_COLUMNS, evaluated)
+    return (
+        typed_table(UPDATE_COLUMNS, updates),
+        typed_table(EVALUATION_COLUMNS, evaluated),
+        typed_table(COUNTED_COLUMNS, counted),
+    )
 
 
 def _others(folder: Path, config: Mapping[str, Any], problems: list[LogProblem]) -> PlacedOthers | None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
@@ -19,10 +20,12 @@ from deepracer_exp.env.placement import PlacedOthers, read_placements
 from deepracer_exp.env.trace import SCHEMA, TRACE_COLUMNS
 from deepracer_exp.errors import BadInput, RunFailed
 
+from .files import read_config
+
 if TYPE_CHECKING:
     import pandas as pd
 
-_ENDING, _OTHERS_ENDING = "-iteration.parquet", "-others.parquet"
+_ENDING, _OTHERS_ENDING, _OPEN_ENDING = "-iteration.parquet", "-others.parquet", "-open.parquet"
 EVALUATION_OTHERS = "others.parquet"
 """The others of an evaluation, beside the control steps in its folder; the file says among whom it raced."""
 _RACE: TypeAdapter[RaceConfig] = TypeAdapter(RaceConfig)
@@ -78,15 +81,18 @@ class TraceWriter:
         Raises:
             RunFailed: a file is complete and cannot be written (disk full, folder read-only).
         """
-        place = steps.column_names.index("reward")
-        rewards = pa.array(rounded_rewards(steps["reward"].to_numpy()))
-        rounded = steps.set_column(place, "reward", rewards).cast(_STORED)
-        self._steps.append(rounded)
+        self._keep(iteration, _rounded(steps), others)
+
+    def _keep(self, iteration: int, rounded: pa.Table, others: pa.Table | None) -> None:
+        self._steps += [rounded] if len(rounded) else []
         if others is not None:
             self._others.append(others)
-        self._iteration, self._rows = iteration, self._rows + len(steps)
+        self._iteration, self._rows = iteration, self._rows + len(rounded)
         if self._rows >= MOST_ROWS:
             self.flush()
+
+    def resume(self, iteration: int) -> None:
+        """Resume after an iteration: there is nothing to take up, every step was written."""
 
     def flush(self) -> None:
         """Write what was added since the file before.
@@ -122,6 +128,51 @@ class TraceWriter:
             raise RunFailed(f"{path}: the trace cannot be written: {error.strerror or error}") from error
 
 
+class LapWriter(TraceWriter):
+    """Writes the steps of complete laps only.
+
+    Those of the episodes under way at a checkpoint wait in `00012-open.parquet`, for a run that is resumed from there.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self._open: list[pa.Table] = []
+
+    def resume(self, iteration: int) -> None:
+        """Take up the episodes that were under way after an iteration."""
+        self._iteration = iteration
+        path = self.folder / f"{iteration:05d}{_OPEN_ENDING}"
+        if path.is_file():
+            self._open = [pq.read_table(path).cast(_STORED)]
+
+    def add(self, iteration: int, steps: pa.Table, others: pa.Table | None = None) -> None:
+        """Add the rows of an iteration; raises as `TraceWriter.add`."""
+        rows = pa.concat_tables([*self._open, _rounded(steps)]).unify_dictionaries()
+        episode, is_last = (rows[name].to_numpy() for name in ("episode", "done"))
+        is_lap = pc.equal(pc.cast(rows["episode_status"], pa.string()), "lap_complete").to_numpy()
+        laps = np.isin(episode, episode[is_last & is_lap])
+        self._open = [rows.filter(pa.array(~np.isin(episode, episode[is_last])))]
+        # The rows of a lap were driven in several iterations.
+        lap_rows = rows.filter(pa.array(laps))
+        self._keep(iteration, lap_rows.take(pa.array(np.argsort(episode[laps], kind="stable"))), others)
+
+    def flush(self) -> None:
+        """Write the laps since the file before, and what is under way; raises as `TraceWriter.flush`."""
+        super().flush()
+        if self._open:
+            self._write(_OPEN_ENDING, self._open[0].combine_chunks(), store_decimal_as_integer=True)
+            # The one before belongs to the newest checkpoint until there is another.
+            for path in sorted(self.folder.glob(f"[!.]*{_OPEN_ENDING}"))[:-2]:
+                path.unlink()
+
+
+def _rounded(steps: pa.Table) -> pa.Table:
+    """Return the rows with the types of a file."""
+    place = steps.column_names.index("reward")
+    rewards = pa.array(rounded_rewards(steps["reward"].to_numpy()))
+    return steps.set_column(place, "reward", rewards).cast(_STORED)
+
+
 def rounded_rewards(reward: NDArray[np.float64]) -> NDArray[np.float32]:
     """Return rewards with five digits, and with the four decimals of the service's log lines.
 
@@ -135,16 +186,43 @@ def rounded_rewards(reward: NDArray[np.float64]) -> NDArray[np.float32]:
     return ((bits + half) >> dropped << dropped).view(np.float32)
 
 
+def trace_writer(folder: Path, kept: str) -> TraceWriter | None:
+    """Return what writes the steps that are kept: `full`, `laps`, or `off`: None."""
+    return {"full": TraceWriter, "laps": LapWriter}[kept](folder) if kept != "off" else None
+
+
+def has_trace(folder: Path) -> bool:
+    """Return whether there is a complete file of a trace."""
+    return any(not path.name.startswith(".") for path in folder.glob(f"*{_ENDING}"))
+
+
 def trace_files(folder: Path) -> list[Path]:
     """Return the complete files of a trace, in the order of iterations.
 
     Raises:
-        BadInput: there is none.
+        BadInput: there is none; the line says why.
     """
     files = sorted(path for path in folder.glob(f"*{_ENDING}") if not path.name.startswith("."))
     if not files:
-        raise BadInput(folder, f"no *{_ENDING}", "the folder of a run with its trace")
+        raise BadInput(
+            folder.parent, missing_trace(folder.parent), "a run with its trace, or logs of the service"
+        )
     return files
+
+
+def missing_trace(run: Path) -> str:
+    """Return in words why a run has no steps to read."""
+    try:
+        kept = read_config(run).get("trace")
+    except BadInput:
+        kept = None
+    reasons = {
+        "off": "has no trace: it was trained with trace=off",
+        "laps": "has no trace: trace=laps keeps complete laps, and the run drove none",
+    }
+    return reasons.get(
+        str(kept), "has no trace: `deepracer-exp runs clean` removed it, or the run never drove"
+    )
 
 
 def read_others(folder: Path, least_iteration: int = 0) -> pa.Table | None:

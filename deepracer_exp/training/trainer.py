@@ -35,7 +35,7 @@ from deepracer_exp.runs.files import SUMMARY, TRACE
 from deepracer_exp.runs.fingerprint import fingerprint
 from deepracer_exp.runs.folder import RunFolder
 from deepracer_exp.runs.result import FAILED, FINISHED, INTERRUPTED, Ending
-from deepracer_exp.runs.trace import TraceWriter
+from deepracer_exp.runs.trace import trace_writer
 from deepracer_exp.sim.batch import cores
 
 from .best import BestPolicy
@@ -101,7 +101,7 @@ class Trainer:
         self.metrics = RunMetrics(
             track_names(setup), collector.cars, experiment.car.control_period_s, experiment.stopping
         )
-        self._trace = TraceWriter(folder.path / TRACE)
+        self._trace = trace_writer(folder.path / TRACE, experiment.trace)
         # More threads do not speed up networks of features, and on a busy machine they wait for one another: an
         # update took 25 times as long. Convolutions are worth them while the workers wait for the update, but a trial
         # of a sweep has only the cores that its worker gives it (`collector.threads`).
@@ -216,6 +216,8 @@ class Trainer:
 
     def _write_trace(self, rows: NDArray[np.float64]) -> None:
         """Write the steps of an iteration, and where the others around them were."""
+        if self._trace is None:
+            return
         extra, rows = rows[:, len(PACKED) :], rows[:, : len(PACKED)]
         others = placements_table(self.setup, rows, extra) if extra.shape[1] else None
         self._trace.add(self.iteration, to_table(rows, self.iteration, self.metrics.track_names), others)
@@ -250,7 +252,8 @@ class Trainer:
         if self.rivals is not None:
             state |= self.rivals.state_dict()
         state |= self.best.state_dict()
-        self._trace.flush()
+        if self._trace is not None:
+            self._trace.flush()
         self.checkpoints.save(self.agent, self.counters(), state, best=best)
         if collector is not None:
             self.saved_steps = self.env_steps
@@ -276,6 +279,8 @@ class Trainer:
         if self.rivals is not None:
             self.rivals.load_state_dict(state)
         self.best.load_state_dict(state)
+        if self._trace is not None:
+            self._trace.resume(self.iteration)
 
     def replay(self, rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         """Pass the rows of metrics.jsonl up to the checkpoint to the callbacks again; return them as they left them."""
@@ -307,7 +312,8 @@ class Trainer:
         summary["best"] = self.best.record
         logger.log(logging.ERROR if error else logging.INFO, "%s", ending, exc_info=error)
         try:
-            self._trace.flush()
+            if self._trace is not None:
+                self._trace.flush()
             self.folder.write(SUMMARY, json.dumps(summary, indent=2) + "\n")
         except (OSError, RunFailed):
             if ending.status != FAILED:

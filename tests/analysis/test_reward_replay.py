@@ -12,7 +12,6 @@ from deepracer_exp.analysis.reward_replay import ReplayedRewards
 from deepracer_exp.aws.logs.recording import STEP_COLUMNS
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.parse import parse_experiment
-from deepracer_exp.env.trace import SCHEMA
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.source import named_reward_source
 from deepracer_exp.runs import trace
@@ -70,7 +69,8 @@ def test_the_services_own_reward_is_paid_again_in_all_44247_rows_and_in_the_eval
 )
 def test_a_runs_own_reward_is_paid_again_in_every_row(tmp_path, monkeypatch, overrides):
     # Without the rounding of traces, of which the test below tells how much it changes.
-    monkeypatch.setattr(trace, "_STORED", SCHEMA)
+    monkeypatch.setattr(trace, "_rounded", lambda steps: steps)
+    monkeypatch.setattr(trace, "_ENCODINGS", {})
     run = call_in(tmp_path, "train", *IN_PROCESS, *overrides, "budget.iterations=2").folder
     source = named_reward_source(str(run / "reward_function.py"))
     car = parse_experiment(read_config(run)).car

@@ -38,7 +38,16 @@ def composed(group: str, name: str) -> tuple[Experiment, Composition]:
 def test_the_groups_are_the_fields_of_an_experiment():
     fields = {field.name for field in dataclasses.fields(Experiment)}
     assert set(groups()) - {"experiment"} <= fields
-    assert fields - set(groups()) == {"name", "seed", "device", "runs_dir", "debug", "report", "teacher"}
+    assert fields - set(groups()) == {
+        "name",
+        "seed",
+        "device",
+        "runs_dir",
+        "debug",
+        "report",
+        "teacher",
+        "trace",
+    }
 
 
 def test_every_folder_of_options_belongs_to_an_entry_point():
