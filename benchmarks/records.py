@@ -8,11 +8,13 @@ as `benchmarks.longer` does, and its best checkpoint drives 64 fresh laps from s
 conditions. The lap of a seed is the mean of its complete laps, from standstill, by the service's clock. Beside it
 stands the fastest lap of the car within the recipe's limits, from standstill at the start line, and its bound from
 below (`deepracer-exp tracks NAME --fastest`). Tracks with official boards of time trials since March 2020 are trained
-again with the car of their newest board.
+again with the car of their newest board. A record there is the fastest single lap of several in a row: beside it stands
+the fastest lap of each seed in eight races of three laps in a row from the start line.
 
 JSON has, in `tracks` and `official`, for each track `bound_s`, `fastest_s`, `fastest_over_bound`, the `laps_s` of the
 seeds (null: none complete), their `median_s` and `best_s`, `median_over_fastest`, `completion`, the mean share of
-complete laps, and `train_s`, the longest of the trainings; official ones `car` and `record_s` as well.
+complete laps, and `train_s`, the longest of the trainings; official ones `car`,
+`record_s` and `flying_laps_s` of the seeds as well.
 `--runs-dir DIR` leaves the runs in DIR and takes those that it, or `benchmarks.longer`, finished there: an interrupted
 benchmark continues.
 """
@@ -28,16 +30,19 @@ from typing import Any
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.setup import build_courses
 from deepracer_exp.errors import BadInput
+from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.evaluation.result import USUAL
 from deepracer_exp.fastest.lap import Question, fastest_lap
 from deepracer_exp.tracks.boards import boards_of
 
 from .all_tracks import TRACKS
 from .command import at_once, read_summary, trained
-from .fresh import Driven, drive
+from .fresh import Driven, drive, protocol, stored_policy
 from .longer import training_overrides
 from .report import benchmark_parser, median, number, percent, table, with_exit_code, write_json
 
 _RECIPE = "fast_lap"
+_RACES, _SEED = 8, 20_181_128
 
 
 def figures(bound_s: float, fastest_s: float, driven: Sequence[Driven]) -> dict[str, Any]:
@@ -56,6 +61,22 @@ def figures(bound_s: float, fastest_s: float, driven: Sequence[Driven]) -> dict[
         "median_over_fastest": None if middle is None else round(middle / fastest_s - 1.0, 4),
         "completion": round(sum(one.lap_share for one in driven) / len(driven), 4),
     }
+
+
+def fastest_in_a_row(run: Path) -> float | None:
+    """Return the fastest lap, seconds, of a run's best policy in races of three laps in a row; None: none complete."""
+    experiment, policy = stored_policy(run)
+    config = protocol(
+        *(
+            "evaluation=three_trials",
+            f"evaluation.trials={_RACES}",
+            "evaluation.laps=3",
+            "evaluation.starts=[0.0]",
+        ),
+        *("evaluation.held_out=null", f"evaluation.seed={_SEED}"),
+    )
+    times_s = Evaluator(experiment, config)(policy).on(USUAL).lap_times_s.tolist()
+    return min(times_s, default=None)
 
 
 def measure(
@@ -90,7 +111,10 @@ def measure(
         of_track = [run.resolve() for run in runs[index * options.seeds : (index + 1) * options.seeds]]
         driven = [drive(run, [None])[0] for run in of_track]
         train_s = max(read_summary(run)["wall_clock_s"] for run in of_track)
-        rows.append({**figures(fastest.bound_s, fastest.lap_time_s, driven), "train_s": round(train_s, 1)})
+        row = {**figures(fastest.bound_s, fastest.lap_time_s, driven), "train_s": round(train_s, 1)}
+        if places[index][1] is not None:
+            row["flying_laps_s"] = [fastest_in_a_row(run) for run in of_track]
+        rows.append(row)
         print(f"{name}: {rows[-1]}", flush=True)
     return rows
 
@@ -118,7 +142,7 @@ def show(rows: dict[str, dict[str, Any]]) -> str:
     """Return the figures of tracks as a table."""
     head = (
         *("track", "bound (s)", "fastest (s)", "above it", "median lap (s)", "above fastest", "best lap (s)"),
-        *("complete", "training (s)", "record (s)"),
+        *("complete", "training (s)", "flying lap (s)", "record (s)"),
     )
     return table(
         head,
@@ -133,6 +157,7 @@ def show(rows: dict[str, dict[str, Any]]) -> str:
                 number(row["best_s"], 2),
                 percent(row["completion"]),
                 number(row["train_s"], 0),
+                number(min((t for t in row.get("flying_laps_s", ()) if t is not None), default=None), 2),
                 number(row.get("record_s"), 2),
             )
             for name, row in rows.items()
