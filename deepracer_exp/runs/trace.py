@@ -84,7 +84,7 @@ class TraceWriter:
         self._keep(iteration, _rounded(steps), others)
 
     def _keep(self, iteration: int, rounded: pa.Table, others: pa.Table | None) -> None:
-        self._steps += [rounded] if len(rounded) else []
+        self._steps.append(rounded)
         if others is not None:
             self._others.append(others)
         self._iteration, self._rows = iteration, self._rows + len(rounded)
@@ -155,6 +155,8 @@ class LapWriter(TraceWriter):
         # The rows of a lap were driven in several iterations.
         lap_rows = rows.filter(pa.array(laps))
         self._keep(iteration, lap_rows.take(pa.array(np.argsort(episode[laps], kind="stable"))), others)
+        if not laps.any():
+            self._steps.pop()  # a run without a lap has no trace
 
     def flush(self) -> None:
         """Write the laps since the file before, and what is under way; raises as `TraceWriter.flush`."""
@@ -204,9 +206,7 @@ def trace_files(folder: Path) -> list[Path]:
     """
     files = sorted(path for path in folder.glob(f"*{_ENDING}") if not path.name.startswith("."))
     if not files:
-        raise BadInput(
-            folder.parent, missing_trace(folder.parent), "a run with its trace, or logs of the service"
-        )
+        raise BadInput(folder, missing_trace(folder.parent), "the folder of a run with its trace")
     return files
 
 

@@ -144,5 +144,5 @@ def test_without_a_trace_there_is_nothing_to_read(folder):
         read_run_recording(folder)
     shutil.rmtree(folder / "trace")
     assert not is_traced_run(folder)
-    with pytest.raises(BadInput, match=r"no \*-iteration.parquet; accepted: the folder of a run"):
+    with pytest.raises(BadInput, match=r"has no trace: .*; accepted: the folder of a run"):
         read_run_recording(folder)
