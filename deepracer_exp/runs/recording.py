@@ -166,20 +166,23 @@ def read_run_recording(folder: Path) -> RunRecording:
 
 
 def _steps(folder: Path, problems: list[LogProblem], files: list[Path]) -> pd.DataFrame:
-    """Read the newest files of the trace that together have no more than `MOST_STEPS` rows."""
+    """Read the newest iterations of the trace that together have no more than `MOST_STEPS` rows."""
     traces = trace_files(folder / TRACE)
     tables: dict[Path, pa.Table] = {}
-    rows = left_out = 0
+    room, left_out = sim_trace.MOST_STEPS, 0
     for path in reversed(traces):
         try:
-            count = pq.read_metadata(path).num_rows
-            rows += count
-            if rows > sim_trace.MOST_STEPS:
-                left_out += count
-            else:
-                tables[path] = pq.ParquetFile(path).read(columns=_READ, use_threads=False).cast(_SCHEMA)
+            count = skipped = pq.read_metadata(path).num_rows
+            if room:
+                table = pq.ParquetFile(path).read(columns=_READ, use_threads=False).cast(_SCHEMA)
+                skipped = _too_old(table, room)
+                if skipped < count:
+                    tables[path] = table.slice(skipped)
         except (OSError, pa.ArrowException, KeyError, ValueError) as error:
             problems.append(LogProblem(str(path), None, f"left out: {_one_line(error)}"))
+            continue
+        left_out += skipped
+        room = 0 if skipped else room - count
     if left_out:
         reason = sim_trace.left_out_reason(left_out)
         problems.append(LogProblem(str(folder / TRACE), None, reason, lines=left_out))
@@ -202,6 +205,14 @@ def _steps(folder: Path, problems: list[LogProblem], files: list[Path]) -> pd.Da
     others = [word for word in words.categories if word not in EPISODE_STATUS]
     steps["episode_status"] = words.set_categories([*EPISODE_STATUS, *others])
     return steps
+
+
+def _too_old(table: pa.Table, room: int) -> int:
+    """Return how many of the first rows go, so that `room` rows of whole iterations at most are left."""
+    if len(table) <= room:
+        return 0
+    iterations = table["iteration"].to_numpy()
+    return int(np.searchsorted(iterations, iterations[-room - 1], side="right"))
 
 
 def _config(folder: Path, problems: list[LogProblem], files: list[Path]) -> Mapping[str, Any]:
