@@ -11,7 +11,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from deepracer_exp.config.race import RaceConfig
@@ -32,11 +31,10 @@ _RACE: TypeAdapter[RaceConfig] = TypeAdapter(RaceConfig)
 DECIMALS = {
     **dict.fromkeys(("X", "Y", "yaw", "track_len"), 4),
     **dict.fromkeys(("steer", "throttle", "pause_duration"), 2),
-    **{"progress": 5, "tstamp": 6, "speed_mps": 3},
+    **{"progress": 6, "tstamp": 6, "speed_mps": 3},
 }
 """Decimals that are kept: those of the service's log lines, and more of progress and time, whose differences are
-used. A reward keeps what `rounded_rewards` returns. Rounded, a row takes 15 bytes instead of 63."""
-_REWARD_BITS, _REWARD_DECIMAL_BITS = 16, 14
+used. Rounded, a row takes 16 bytes instead of 63."""
 MOST_ROWS = 2**17
 """Steps after which a file is complete, if no checkpoint is written before: as many as fit into memory without notice,
 and enough that the description of its columns takes no share of it."""
@@ -81,7 +79,7 @@ class TraceWriter:
         Raises:
             RunFailed: a file is complete and cannot be written (disk full, folder read-only).
         """
-        self._keep(iteration, _rounded(steps), others)
+        self._keep(iteration, steps.cast(_STORED), others)
 
     def _keep(self, iteration: int, rounded: pa.Table, others: pa.Table | None) -> None:
         self._steps.append(rounded)
@@ -147,7 +145,7 @@ class LapWriter(TraceWriter):
 
     def add(self, iteration: int, steps: pa.Table, others: pa.Table | None = None) -> None:
         """Add the rows of an iteration; raises as `TraceWriter.add`."""
-        rows = pa.concat_tables([*self._open, _rounded(steps)]).unify_dictionaries()
+        rows = pa.concat_tables([*self._open, steps.cast(_STORED)]).unify_dictionaries()
         episode, is_last = (rows[name].to_numpy() for name in ("episode", "done"))
         is_lap = pc.equal(pc.cast(rows["episode_status"], pa.string()), "lap_complete").to_numpy()
         laps = np.isin(episode, episode[is_last & is_lap])
@@ -166,26 +164,6 @@ class LapWriter(TraceWriter):
             # The one before belongs to the newest checkpoint until there is another.
             for path in sorted(self.folder.glob(f"[!.]*{_OPEN_ENDING}"))[:-2]:
                 path.unlink()
-
-
-def _rounded(steps: pa.Table) -> pa.Table:
-    """Return the rows with the types of a file."""
-    place = steps.column_names.index("reward")
-    rewards = pa.array(rounded_rewards(steps["reward"].to_numpy()))
-    return steps.set_column(place, "reward", rewards).cast(_STORED)
-
-
-def rounded_rewards(reward: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return rewards with five digits, and with the four decimals of the service's log lines.
-
-    Their last bits are 0: the error is at most 2^-17 of a reward, and at most half of the fourth decimal up to 512,
-    from where all bits of float32 are kept.
-    """
-    bits = reward.astype(np.float32).view(np.int32)
-    exponent = (bits >> 23 & 0xFF) - 127
-    dropped = np.minimum(23 - _REWARD_BITS, np.maximum(23 - _REWARD_DECIMAL_BITS - exponent, 0))
-    half = (1 << dropped) >> 1
-    return ((bits + half) >> dropped << dropped).view(np.float32)
 
 
 def trace_writer(folder: Path, kept: str) -> TraceWriter | None:

@@ -12,6 +12,7 @@ from deepracer_exp.analysis.reward_replay import ReplayedRewards
 from deepracer_exp.aws.logs.recording import STEP_COLUMNS
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.parse import parse_experiment
+from deepracer_exp.env.trace import SCHEMA
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.source import named_reward_source
 from deepracer_exp.runs import trace
@@ -68,8 +69,8 @@ def test_the_services_own_reward_is_paid_again_in_all_44247_rows_and_in_the_eval
     "overrides", [(), ("track=Bowtie_track", "track.direction=alternate"), ("reward=progress_delta",)]
 )
 def test_a_runs_own_reward_is_paid_again_in_every_row(tmp_path, monkeypatch, overrides):
-    # Without the rounding of traces, of which the test below tells how much it changes.
-    monkeypatch.setattr(trace, "_rounded", lambda steps: steps)
+    # Without the rounding of traces, whose effect the test below measures.
+    monkeypatch.setattr(trace, "_STORED", SCHEMA)
     monkeypatch.setattr(trace, "_ENCODINGS", {})
     run = call_in(tmp_path, "train", *IN_PROCESS, *overrides, "budget.iterations=2").folder
     source = named_reward_source(str(run / "reward_function.py"))
@@ -83,8 +84,8 @@ def test_a_runs_own_reward_is_paid_again_in_every_row(tmp_path, monkeypatch, ove
 def test_the_decimals_of_a_trace_are_enough_to_pay_a_reward_again(trained):
     run = trained("reward=progress_delta", "budget.iterations=2").folder
     replayed = replay_reward(prepare(read_run_recording(run)), "progress_delta")
-    # A step's gain is known to 1e-5% of a lap of 17.7 m, the recorded reward to five digits.
-    np.testing.assert_allclose(replayed.steps["new_reward"], replayed.steps["reward"], rtol=1e-5, atol=4e-6)
+    # A step's gain is known to 1e-6% of a lap of 17.7 m, the recorded reward to seven digits.
+    np.testing.assert_allclose(replayed.steps["new_reward"], replayed.steps["reward"], rtol=1e-6, atol=4e-7)
 
 
 def test_step_by_step_and_all_at_once_pay_the_same(own, reward):
