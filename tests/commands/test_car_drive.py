@@ -102,7 +102,7 @@ def test_large_frames_are_made_smaller_as_the_car_does(tmp_path):
         (("analyze", "{bag}", "--replay", "laps.html"), "--replay"),
         (("analyze", "{bag}", "--target", "9"), "--target"),
         (("analyze", "{bag}", "checkpoint=last"), "of which run?"),
-        (("analyze", "{bag}", "nobody"), "no such run"),
+        (("analyze", "{bag}", "missing"), "no such run"),
         (("analyze", "{bag}", "a", "b"), "3 given"),
         (("compare", "{bag}", "{bag}"), "by deepracer-exp analyze and watch"),
         (("watch", "{bag}", "--live"), "--live"),

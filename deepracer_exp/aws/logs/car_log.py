@@ -158,7 +158,7 @@ def _is_bag(folder: Path) -> bool:
             return True
         with (folder / _METADATA).open("rb") as file:
             return file.read(40).startswith(b"rosbag2_bagfile_information")
-    except OSError:  # no such file, or a folder of somebody else's
+    except OSError:  # no such file, or a folder that may not be read
         return False
 
 
