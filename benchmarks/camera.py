@@ -186,10 +186,7 @@ def explain_frames(folder: Path, lens: Lens) -> dict[str, Any]:
     Raises:
         BadInput: the folder has no pictures.
     """
-    files = sorted(folder.glob("*.png"))
-    if not files:
-        raise BadInput(f"--frames {folder}: no *.png there; accepted: a folder of pictures, 160x120")
-    frames = np.stack([np.asarray(Image.open(file).convert("RGB"), np.float32) @ GREY for file in files])
+    frames = read_frames(folder)
     track = Track.from_config(compose_experiment([f"track={FRAMES_TRACK}"])[0].tracks[FRAMES_TRACK])
     scenery = build_scenery(track)
     own = colors = floor_colors(track.floor) @ GREY
@@ -203,6 +200,22 @@ def explain_frames(folder: Path, lens: Lens) -> dict[str, Any]:
         "frames": len(held_out),
         **{f"grey_{name}": float(value) for name, value in zip(MATERIALS, colors, strict=True)},
     }
+
+
+def read_frames(folder: Path) -> NDArray[np.float32]:
+    """Return the pictures in a folder in grey, in the order of their names, (n, 120, 160), 0 to 255.
+
+    Raises:
+        BadInput: the folder has no pictures, or one is of another size.
+    """
+    files = sorted(folder.glob("*.png"))
+    if not files:
+        raise BadInput(f"--frames {folder}: no *.png there; accepted: a folder of pictures, 160x120")
+    frames = [np.asarray(Image.open(file).convert("RGB"), np.float32) @ GREY for file in files]
+    for file, frame in zip(files, frames, strict=True):
+        if frame.shape != (HEIGHT, WIDTH):
+            raise BadInput(f"--frames {file}: {frame.shape[1]}x{frame.shape[0]}; accepted: {WIDTH}x{HEIGHT}")
+    return np.stack(frames)
 
 
 def compare_frames(

@@ -1,7 +1,7 @@
 """What `experiment=real_car` drives in the simulator and as the physical car, and what its ingredients bring.
 
     python -m benchmarks.real_car [--seeds 5] [--tracks A,B] [--without smoothness,...] [--jobs 1]
-                                  [--runs-dir DIR] [--json FILE] [OVERRIDE...]
+                                  [--frames DIR] [--runs-dir DIR] [--json FILE] [OVERRIDE...]
 
 For each track and seed `deepracer-exp train experiment=real_car` trains as the experiment has it, and once more without
 each of the ingredients of `--without`: without `smoothness` of the policy's actions; without the `car`'s own picture,
@@ -18,7 +18,10 @@ seed, null where there is none, with the interquartile mean over seeds and its 9
 - `steps`, `train_s`: of the whole training, its evaluations included;
 - `laps_simulator`, `laps_sim2real`, `laps_picture`, `laps_timing`, `laps_controls`, `laps_car`: share of complete laps;
 - `lap_s_simulator`, ...: mean time of these;
-- `zigzag_simulator`, `zigzag_car`: changes of steering from side to side a metre of straight.
+- `zigzag_simulator`, `zigzag_car`: changes of steering from side to side a metre of straight;
+- with `--frames DIR`, pictures of 160x120 that AWS's simulator took: `openvino_same`, the share of them on which the
+  archive for the car decides the same in OpenVINO, the car's converter, as the policy does here, and
+  `openvino_difference`, the largest difference of a probability, or of steering or speed as a share of its range.
 
 `--runs-dir DIR` leaves the runs in DIR and takes those that it finds finished there: an interrupted benchmark
 continues.
@@ -33,15 +36,23 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from torch import Tensor
 
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.evaluation import EvaluationConfig
+from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.evaluate import CAR, SIMULATOR, car_protocols
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.evaluation.result import USUAL
+from deepracer_exp.evaluation.result import NOTHING, USUAL
+from deepracer_exp.export.car_archive import car_archive
+from deepracer_exp.export.car_converter import NEEDED, Conversion, compare_in_openvino, has_openvino
+from deepracer_exp.export.onnx import DeployedPolicy
+from deepracer_exp.lookup.resolve import StoredRun
 
+from .camera import read_frames
 from .command import at_once, read_summary, trained
 from .fresh import fresh_trials, stored_policy
 from .report import (
@@ -85,8 +96,8 @@ def protocols() -> dict[str, EvaluationConfig]:
     return dict([simulator, under_sim2real, *parts, (CAR, config)])
 
 
-def measure(run: Path) -> dict[str, float | None]:
-    """Return the figures of a run."""
+def measure(run: Path, frames: Tensor | None) -> dict[str, float | None]:
+    """Return the figures of a run; `frames` are pictures (n, 1, 120, 160), bytes, None: there are none."""
     torch.set_num_threads(1)
     summary = read_summary(run)
     experiment, policy = stored_policy(run)
@@ -96,11 +107,27 @@ def measure(run: Path) -> dict[str, float | None]:
         figures |= {f"laps_{name}": driven.lap_share, f"lap_s_{name}": driven.mean_lap_time_s}
         if name in (SIMULATOR, CAR):
             figures[f"zigzag_{name}"] = driven.zigzag.changes_per_m
-    return {name: None if value is None else round(value, 4) for name, value in figures.items()}
+    if frames is not None:
+        converted = convert(run, frames)
+        figures |= {"openvino_same": converted.same.mean(), "openvino_difference": converted.difference}
+    return {name: None if value is None else round(float(value), 5) for name, value in figures.items()}
+
+
+def convert(run: Path, frames: Tensor) -> Conversion:
+    """Compare what OpenVINO decides on pictures with the run's best policy."""
+    stored = StoredRun(run).with_checkpoint(None)
+    networks, experiment = stored.read_policy().networks, stored.experiment
+    policy = DeployedPolicy(networks, build_action_space(experiment.action_space)).eval()
+    return compare_in_openvino(car_archive(networks, experiment), policy, [frames])
 
 
 def benchmark(options: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
     """Train what is not in `folder` yet, drive, and return a row for each track and ingredient left out."""
+    frames = None
+    if options.frames is not None:
+        if not has_openvino():
+            raise BadInput(f"--frames {options.frames}", "needs OpenVINO", NEEDED)
+        frames = torch.from_numpy(np.rint(read_frames(options.frames)).astype(np.uint8))[:, None]
     asked = [
         (track, without, training_overrides(track, without, options.overrides))
         for track in options.tracks
@@ -118,7 +145,7 @@ def benchmark(options: argparse.Namespace, folder: Path) -> list[dict[str, Any]]
     runs = at_once(options.jobs, calls)
     rows = []
     for index, (track, without, _) in enumerate(asked):
-        driven = [measure(run) for run in runs[index * options.seeds : (index + 1) * options.seeds]]
+        driven = [measure(run, frames) for run in runs[index * options.seeds : (index + 1) * options.seeds]]
         figures = {name: over_seeds([one[name] for one in driven]) for name in driven[0]}
         rows.append({"track": track, "without": without, **figures})
         print(table(HEAD, [_cells(rows[-1])]), flush=True)
@@ -136,7 +163,7 @@ HEAD = (
         "timing",
         "controls",
     ),
-    *("car", "lap (s): simulator", "car", "zig-zag /m: simulator", "car"),
+    *("car", "lap (s): simulator", "car", "zig-zag /m: simulator", "car", "same in OpenVINO"),
 )
 
 
@@ -153,6 +180,7 @@ def _cells(row: dict[str, Any]) -> tuple[str, ...]:
         *laps,
         *(iqm_text(row[f"lap_s_{name}"], seconds) for name in (SIMULATOR, CAR)),
         *(iqm_text(row[f"zigzag_{name}"], seconds) for name in (SIMULATOR, CAR)),
+        iqm_text(row["openvino_same"], percent) if "openvino_same" in row else NOTHING,
     )
 
 
@@ -167,6 +195,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--without", type=_names, default=("smoothness",), help=f"some of {known}; default: smoothness"
     )
     parser.add_argument("--jobs", type=int, default=1, help="trainings at once")
+    parser.add_argument(
+        "--frames", type=Path, help="folder of pictures, 160x120, for the archive in OpenVINO"
+    )
     parser.add_argument("--runs-dir", type=Path, help="folder of the runs; left out: they are not kept")
     options = parser.parse_args(arguments)
     unknown = [name for name in options.without if name not in WITHOUT]

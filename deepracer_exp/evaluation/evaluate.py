@@ -192,6 +192,7 @@ def evaluate_run(
     err.print(
         f"{run.path.name}, checkpoint {stored.path.name}: {count(len(evaluator.trials), 'trial')}"
         + _against(plan, rival, evaluator),
+        soft_wrap=True,
         highlight=False,
     )
     evaluation = evaluator(

@@ -9,15 +9,19 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from rich.console import Console
+from rich.padding import Padding
 from rich.table import Table
+from rich.text import Text
 from tensordict import TensorDict
 from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from deepracer_exp.agents.actor_critic import PolicyNetworks
 from deepracer_exp.analysis.zigzag import CURE, ZIGZAG_DEG, ZIGZAG_PER_M, ZigZag
 from deepracer_exp.aws.models.car_archive import describe_commands
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.env.action_space import ActionSpace
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.trace import PACKED, STATUS_CODE
 from deepracer_exp.errors import RunFailed, writing
@@ -33,13 +37,15 @@ from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.film import LapRecorder, best_attempt, png
 from deepracer_exp.evaluation.plan import EvaluatePlan
 from deepracer_exp.evaluation.race_protocol import RaceProtocol
-from deepracer_exp.evaluation.result import NOTHING, USUAL, Evaluation, number
+from deepracer_exp.evaluation.result import USUAL, Evaluation, number
 from deepracer_exp.files import atomic_write
 from deepracer_exp.reports.picture_changes import TriedPictures, pictures_sheet, try_pictures
 from deepracer_exp.runs.files import FILMS
 from deepracer_exp.runs.result import RELIABLE
 
-from .car_archive import car_archive
+from .car_archive import CarArchive, car_archive
+from .car_converter import NEEDED, Conversion, compare_in_openvino, has_openvino
+from .onnx import DeployedPolicy
 
 LEAST_ON_CAR = 0.9
 """Share of complete laps wanted with each part of the car and with all; in the simulator it is `RELIABLE`."""
@@ -47,6 +53,8 @@ LEAST_FACTOR = 4.0
 """Pictures that the network must read here, on one core, in the time of one on the car, whose processor is slower."""
 MOST_BAD = 0.05
 """Share of a lap's pictures that may decide badly."""
+LEAST_SAME = 0.99
+"""Share of a lap's pictures on which the car's converter must decide as the policy does here."""
 _NEAR = 5
 """Percentile of the distance to the road's edge that is shown."""
 _TIMED = 20
@@ -74,6 +82,8 @@ class CarCheck:
     """Time between two pictures on the car."""
     pictures: TriedPictures
     """The pictures of the best lap with all parts of the car."""
+    conversion: Conversion | None
+    """What the car's converter decides on these pictures; None: it is not installed."""
 
     @property
     def factor(self) -> float:
@@ -111,6 +121,11 @@ class CarCheck:
         changes_per_m, amplitude_deg = self.zigzag.changes_per_m, self.zigzag.amplitude_deg
         if (changes_per_m or 0.0) >= ZIGZAG_PER_M and (amplitude_deg or 0.0) >= ZIGZAG_DEG:
             steps.append(f"it zig-zags on straights; try {CURE}")
+        if self.conversion is not None and self.conversion.same.mean() < LEAST_SAME:
+            steps.append(
+                f"in OpenVINO, the car's converter, it decides otherwise: {self.conversion.words()}, wanted "
+                f"{LEAST_SAME:.0%}; choose another checkpoint (checkpoint=NAME)"
+            )
         if self.pictures.bad_share > MOST_BAD:
             steps.append(
                 f"{self.pictures.bad_share:.0%} of the pictures decide badly, wanted {MOST_BAD:.0%}; train with the "
@@ -138,11 +153,10 @@ def check_run(plan: EvaluatePlan, picture: Path | None, out: Console, err: Conso
     archive = car_archive(stored.networks, experiment)
     torch.set_num_threads(1)
     policy = stored.networks.policy
+    err.print(f"{run.path.name}, checkpoint {stored.path.name}", soft_wrap=True, highlight=False)
     laps = {}
     for name, protocol in {**car_protocols(config), CAR: config}.items():
-        err.print(
-            f"{run.path.name}, checkpoint {stored.path.name}: {_NAMES.get(name, name)}", highlight=False
-        )
+        err.print(f"  driving {_NAMES.get(name, f'with the {name} of the car')}", highlight=False)
         evaluator = Evaluator(experiment, protocol)
         edges = _Edges(evaluator)
         laps[name] = CarLaps(evaluator(policy, edges), edges.near_m())
@@ -155,21 +169,11 @@ def check_run(plan: EvaluatePlan, picture: Path | None, out: Console, err: Conso
         network_time_s(policy, acted[:1]),
         car.car.control_period_s,
         try_pictures(policy, acted, car.actions),
+        _converted(archive, stored.networks, car.actions, acted) if has_openvino() else None,
     )
     evaluations = {name: driven.evaluation for name, driven in laps.items()}
     results = write_evaluation(run.path, laps[CAR].evaluation, config, stored, evaluations)
-    out.print("What the car makes of the actions, with its maximum speed at 100%:")
-    for line in (*describe_commands(archive.metadata), *archive.notes):
-        out.print(f"  {line}", soft_wrap=True, highlight=False)
-    out.print()
-    out.print(laps_table(laps))
-    out.print(
-        f"edge cm: how near the car's front comes to the road's edge in the nearest {_NEAR}% of the steps; below 0 it "
-        "is beyond it\n",
-        soft_wrap=True,
-        highlight=False,
-    )
-    out.print(figures_table(check, experiment, config))
+    files = {}
     if len(check.pictures.bad):
         file = picture or run.path / FILMS / f"{stored.path.name}-car.png"
         camera = experiment.observation.camera
@@ -177,17 +181,67 @@ def check_run(plan: EvaluatePlan, picture: Path | None, out: Console, err: Conso
         with writing(file, failure=RunFailed):
             file.parent.mkdir(exist_ok=True)
             atomic_write(file, png(pictures_sheet(check.pictures, policy, camera)))
-        out.print(f"  pictures  {file}", soft_wrap=True, highlight=False)
-    out.print(f"  results   {results}\n", soft_wrap=True, highlight=False)
+        files["pictures"] = file
+    files["results"] = results
+    print_check(check, archive, experiment, config, out)
+    out.print()
+    for name, file in files.items():
+        out.print(f"  {name:8}  {file}", soft_wrap=True, highlight=False)
+    out.print()
     steps = check.to_do()
     if not steps:
         out.print("ready", style="bold")
     for step in steps:
-        out.print(f"not ready: {step}", soft_wrap=True, highlight=False)
+        # In a pipe, a line for each.
+        out.print(f"not ready: {step}", soft_wrap=not out.is_terminal, highlight=False)
     return check
 
 
+def print_check(
+    check: CarCheck, archive: CarArchive, experiment: Experiment, config: EvaluationConfig, out: Console
+) -> None:
+    """Print what was found out in tables that fit 80 columns, and in sentences."""
+
+    def say(*lines: str) -> None:
+        for line in lines:
+            if out.is_terminal:
+                out.print(Padding(Text(line), (0, 0, 0, 2), expand=False))
+            else:
+                out.print(Text(f"  {line}"), soft_wrap=True)
+
+    out.print("What the car makes of the actions, with its maximum speed at 100%:")
+    say(*describe_commands(archive.metadata), *archive.notes)
+    out.print()
+    out.print(laps_table(check.laps))
+    say(
+        f"edge cm: how near the car's front comes to the road's edge in the nearest {_NEAR}% of the steps; below 0 it "
+        "is beyond it"
+    )
+    out.print()
+    out.print(figures_table(check))
+    out.print()
+    trained_hz = experiment.car.control_hz
+    say(
+        f"a picture takes {1000 * check.network_s:.2f} ms here on one core, {1000 * check.frame_s:.1f} ms pass between "
+        "two on the car",
+        f"{1 / check.frame_s:g} actions a second, {trained_hz:g} in the training",
+        *explain_controls(experiment, config),
+    )
+    if check.conversion is None:
+        say(f"the archive was not tried in OpenVINO, the car's converter: {NEEDED}")
+    if len(check.pictures.bad):
+        say(f"pictures that decide badly, by what changed: {check.pictures.by_change()}")
+
+
 _NAMES = {SIMULATOR: "in the simulator", CAR: "as on the car"}
+
+
+def _converted(
+    archive: CarArchive, networks: PolicyNetworks, actions: ActionSpace, acted: TensorDict
+) -> Conversion:
+    """Compare what OpenVINO decides with the policy on what was seen in n steps, [n]."""
+    deployed = DeployedPolicy(networks, actions).eval()
+    return compare_in_openvino(archive, deployed, [acted[key] for key in deployed.in_keys])
 
 
 def laps_table(laps: Mapping[str, CarLaps]) -> Table:
@@ -203,35 +257,34 @@ def laps_table(laps: Mapping[str, CarLaps]) -> Table:
             names.get(name, name),
             f"{100 * figures[name]['lap_share']:.0f}",
             f"{100 * wanted:.0f}",
-            number(100 * driven.edge_m, 0),
+            number(np.round(100 * driven.edge_m) + 0.0, 0),  # not -0
             number(figures[name]["lap_time_s"], 2),
             number(driven.evaluation.on(USUAL).zigzag.changes_per_m, 2),
         )
     return shown
 
 
-def figures_table(check: CarCheck, experiment: Experiment, config: EvaluationConfig) -> Table:
-    """Return everything that is no lap as a table of what, on the car, wanted."""
+def figures_table(check: CarCheck) -> Table:
+    """Return the figures that are not of laps, with what is wanted, as a table."""
     shown = Table(box=None, pad_edge=False)
     for name in ("what", "on the car", "wanted"):
-        shown.add_column(name)
-    shown.add_row(
-        "real-time factor",
-        f"{check.factor:.1f}: {1000 * check.network_s:.2f} ms a picture here on one core, "
-        f"{1000 * check.frame_s:.1f} ms between two on the car",
-        f"at least {LEAST_FACTOR:g}",
-    )
-    trained_hz = experiment.car.control_hz
-    shown.add_row("actions a second", f"{1 / check.frame_s:g}, {trained_hz:g} in the training", NOTHING)
-    for line in explain_controls(experiment, config):
-        what, _, words = line.partition(": ")
-        shown.add_row(*((what, words) if words else ("steering", line)), NOTHING)
+        shown.add_column(name, no_wrap=True)
+    shown.add_row("real-time factor", f"{check.factor:.1f}", f"at least {LEAST_FACTOR:g}")
+    amplitude_deg = check.zigzag.amplitude_deg
+    swings = "" if not amplitude_deg or np.isnan(amplitude_deg) else f", {amplitude_deg:.0f} degrees"
     shown.add_row(
         "zig-zag on straights",
-        check.zigzag.words(),
-        f"below {ZIGZAG_PER_M:g} a metre or {ZIGZAG_DEG:g} degrees",
+        f"{number(check.zigzag.changes_per_m, 2)} a metre{swings}",
+        f"below {ZIGZAG_PER_M:g} or {ZIGZAG_DEG:g} degrees",
     )
     shown.add_row("pictures that decide badly", check.pictures.words(), f"at most {MOST_BAD:.0%}")
+    if check.conversion is not None:
+        same = check.conversion.same
+        shown.add_row(
+            "same action in OpenVINO",
+            f"{same.sum():,} of {len(same):,} ({same.mean():.0%})",
+            f"at least {LEAST_SAME:.0%}",
+        )
     return shown
 
 

@@ -56,12 +56,14 @@ class TriedPictures:
         return len(self.bad) / len(self.commands[0])
 
     def words(self) -> str:
-        """Return how many there are, and by which change: ``9 of 242 (4%): darker 5, blurred 4``."""
+        """Return how many there are: ``9 of 242 (4%)``."""
+        return f"{len(self.bad)} of {len(self.commands[0])} ({self.bad_share:.0%})"
+
+    def by_change(self) -> str:
+        """Return how many there are by the change: ``darker 5, blurred 4``."""
         least_deg = BAD_SHARE * self.full_lock_deg
-        by_change = {name: int((np.abs(deg) > least_deg).sum()) for name, deg in self.turned_deg.items()}
-        parts = ", ".join(f"{name} {bad}" for name, bad in by_change.items() if bad)
-        count = f"{len(self.bad)} of {len(self.commands[0])} ({self.bad_share:.0%})"
-        return f"{count}: {parts}" if parts else count
+        turned = {name: int((np.abs(deg) > least_deg).sum()) for name, deg in self.turned_deg.items()}
+        return ", ".join(f"{name} {bad}" for name, bad in turned.items() if bad)
 
 
 def _scaled(pixels: Pixels, factor: float) -> Pixels:

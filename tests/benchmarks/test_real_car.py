@@ -6,10 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 from benchmarks import real_car
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.evaluation.evaluate import CAR, SIMULATOR
+from deepracer_exp.export.car_converter import has_openvino
 from tests.conftest import Ended
 
 
@@ -50,7 +52,8 @@ def test_each_seed_is_trained_whole_and_without(
     figures = ["steps", "train_s", "zigzag_simulator", "zigzag_car"]
     figures += [f"{what}_{name}" for what in ("laps", "lap_s") for name in real_car.protocols()]
 
-    def measured(run: Path) -> dict[str, float | None]:
+    def measured(run: Path, frames: object) -> dict[str, float | None]:
+        assert frames is None
         return {**dict.fromkeys(figures, 120.0), "laps_car": 0.8, "lap_s_car": [8.0, None][int(run.name[-1])]}
 
     monkeypatch.setattr(real_car, "trained", train)
@@ -78,6 +81,7 @@ def test_each_seed_is_trained_whole_and_without(
         (("--without", "luck"), "--without luck"),
         (("--tracks", "nowhere"), "nowhere"),
         (("--seeds", "0"), "--seeds"),
+        (("--frames", "nowhere"), "--frames nowhere"),
     ],
     ids=" ".join,
 )
@@ -97,8 +101,12 @@ def test_a_run_is_measured_under_each_condition(
     asked = real_car.protocols()
     shorter = {name: replace(config, time_s=0.5, trials=1) for name, config in asked.items()}
     monkeypatch.setattr(real_car, "protocols", lambda: shorter)
-    found = real_car.measure(run)
+    frames = torch.randint(0, 256, (5, 1, 120, 160), dtype=torch.uint8) if has_openvino() else None
+    found = real_car.measure(run, frames)
     assert found["steps"] == 64
     assert {name for name in found if name.startswith("laps_")} == {f"laps_{name}" for name in asked}
     assert all(found[f"laps_{name}"] == 0.0 for name in asked if found[f"laps_{name}"] is not None)
     assert {"zigzag_simulator", "zigzag_car"} <= set(found)
+    if frames is not None:
+        assert found["openvino_same"] == 1.0
+        assert found["openvino_difference"] < 0.01

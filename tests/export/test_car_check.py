@@ -1,18 +1,24 @@
 """The check before a drive with the physical car."""
 
+import io
+
 import numpy as np
 import pytest
 import torch
 from PIL import Image
+from rich.console import Console
 from tensordict import TensorDict
 
 from deepracer_exp.analysis.zigzag import ZigZag
+from deepracer_exp.config.compose import compose_evaluation, compose_experiment
 from deepracer_exp.config.driving import CameraConfig
 from deepracer_exp.env.action_space import DiscreteActions
 from deepracer_exp.evaluation.evaluate import CAR, SIMULATOR
 from deepracer_exp.evaluation.race_protocol import Attempt
 from deepracer_exp.evaluation.result import USUAL, Evaluation, TrialGroup
-from deepracer_exp.export.car_check import CarCheck, CarLaps
+from deepracer_exp.export.car_archive import CarArchive, car_actions
+from deepracer_exp.export.car_check import CarCheck, CarLaps, print_check
+from deepracer_exp.export.car_converter import Conversion
 from deepracer_exp.reports.picture_changes import CHANGES, pictures_sheet, spread_out, try_pictures
 
 CAMERA = CameraConfig(width=160, height=120, color="grey", frames=1, stereo_m=0.0, field_of_view_deg=65.0)
@@ -61,10 +67,12 @@ def laps(share, zigzag=STEADY):
     return CarLaps(Evaluation((group,)), 0.1)
 
 
-def check(pictures=(200,), network_s=0.001, zigzag=STEADY, **shares):
+def check(pictures=(200,), network_s=0.001, zigzag=STEADY, same=1.0, **shares):
     policy = Threshold(100)
     driven = {name: laps(shares.get(name, 1.0), zigzag) for name in (SIMULATOR, "picture", "controls", CAR)}
-    return CarCheck(driven, network_s, 1 / 30, try_pictures(policy, seen(policy, *pictures), ACTIONS))
+    tried = try_pictures(policy, seen(policy, *pictures), ACTIONS)
+    conversion = None if same is None else Conversion(np.arange(200) < 200 * same, 0.001)
+    return CarCheck(driven, network_s, 1 / 30, tried, conversion)
 
 
 def test_a_policy_that_loses_nothing_is_ready():
@@ -84,11 +92,50 @@ def test_a_policy_that_loses_nothing_is_ready():
         ({CAR: 0.8}, "all parts together"),
         ({"zigzag": SWERVING}, "zig-zags"),
         ({"pictures": (200, 110)}, "50% of the pictures decide badly"),
+        ({"same": 0.97}, "same action on 194 of 200 pictures, wanted 99%"),
     ],
 )
 def test_each_fault_alone_makes_it_not_ready_and_says_what_to_do(found, words):
     (step,) = check(**found).to_do()
     assert words in step
+
+
+def test_a_converter_that_is_not_installed_is_no_fault():
+    assert check(same=None).to_do() == []
+
+
+def printed(found, columns, is_terminal):
+    experiment, _ = compose_experiment(["experiment=real_car"])
+    config = compose_evaluation(["evaluation=real_car"])[0].evaluation
+    archive = CarArchive(b"", car_actions(ACTIONS)[0], ["a note that does not fit a line of a terminal " * 3])
+    file = io.StringIO()
+    out = Console(file=file, width=columns, force_terminal=is_terminal, color_system=None)
+    print_check(found, archive, experiment, config, out)
+    return [line.rstrip() for line in file.getvalue().splitlines()]
+
+
+@pytest.mark.parametrize("columns", [80, 100, 160])
+def test_rows_of_its_tables_are_one_line_each_and_sentences_break_between_words(columns):
+    lines = printed(check(pictures=(200, 110), zigzag=SWERVING), columns, True)
+    assert max(map(len, lines)) <= columns
+    assert not any("…" in line for line in lines)
+    for what, found, wanted in (
+        ("real-time factor", "33.3", "at least 4"),
+        ("zig-zag on straights", "2.00 a metre, 20 degrees", "below 1 or 5 degrees"),
+        ("pictures that decide badly", "1 of 2 (50%)", "at most 5%"),
+        ("same action in OpenVINO", "200 of 200 (100%)", "at least 99%"),
+    ):
+        (line,) = [line for line in lines if line.startswith(f"{what} ")]
+        assert line.split(what)[1].split("  ")[-1].strip() == wanted
+        assert found in line
+    whole = printed(check(pictures=(200, 110), zigzag=SWERVING), 160, False)
+    assert " ".join(" ".join(lines).split()) == " ".join(" ".join(whole).split())
+
+
+def test_in_a_pipe_each_sentence_is_one_line():
+    lines = printed(check(same=None), 80, False)
+    assert sum("a note that" in line for line in lines) == 1
+    assert any(line.endswith("pip install 'deepracer-exp[car]'") for line in lines)
 
 
 def test_what_fails_in_the_simulator_is_not_blamed_on_the_car():
@@ -101,7 +148,8 @@ def test_only_pictures_in_which_a_small_change_turns_the_wheels_decide_badly():
     policy = Threshold(100)
     tried = try_pictures(policy, seen(policy, 200, 110, 40, 90), ACTIONS)
     assert sorted(tried.bad) == [1, 3]  # 110 * 0.8 and 90 * 1.25 lie on the other side of 100
-    assert tried.words() == "2 of 4 (50%): darker 1, brighter 1"
+    assert tried.words() == "2 of 4 (50%)"
+    assert tried.by_change() == "darker 1, brighter 1"
     sheet = pictures_sheet(tried, policy, CAMERA)
     assert sheet.width == 4 * 320
     assert 240 < sheet.height < 320
@@ -131,6 +179,7 @@ def test_the_command_tells_what_will_happen_on_the_car_and_ends_with_what_to_do(
         assert words in ended.stdout
     for part in ("nothing", "picture", "timing", "controls", "all"):
         assert f"\n{part} " in ended.stdout
+    assert "  driving in the simulator\n" in ended.stderr
     last = ended.stdout.splitlines()[-1]
     assert last == "ready" or last.startswith("not ready: ")
     bad = "pictures  bad.png" in ended.stdout
