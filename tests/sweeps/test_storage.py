@@ -170,6 +170,31 @@ def test_a_server_is_connected_to_only_while_it_is_asked(postgres_server):
     wait_until(lambda: not postgres_server.execute(count)[0][0], "end of the connections")
 
 
+def test_transactions_share_a_connection(postgres_server):
+    storage = open_storage(postgres_server.new_database(), Path())
+    opened = []
+    sa.event.listen(storage.engine, "connect", lambda *_: opened.append(1))
+    study = optuna.create_study(study_name="study", storage=storage)
+    claims = TrialClaims(storage.engine, "study")
+    claim = claims.claim("one", 1, HOUR_S)
+    for _ in range(20):
+        assert claims.renew(claim, HOUR_S)
+        study.set_user_attr("trials", 1)
+    # The first five seconds without a call close it: a busy machine may be that slow.
+    assert len(opened) <= 3
+
+
+def test_a_connection_that_a_restart_of_the_server_broke_fails_no_call(postgres):
+    storage = open_storage(postgres.new_database(), Path())
+    study = optuna.create_study(study_name="study", storage=storage)
+    claims = TrialClaims(storage.engine, "study")
+    claim = claims.claim("one", 1, HOUR_S)
+    postgres.stop()
+    postgres.start()
+    assert claims.renew(claim, HOUR_S)
+    study.set_user_attr("trials", 1)
+
+
 def test_a_stopped_process_holds_a_row_of_postgresql_for_a_minute_at_most(postgres_server):
     url = postgres_server.new_database()
     with open_storage(url, Path()).engine.connect() as connection:

@@ -30,6 +30,8 @@ from deepracer_exp.sweeps import DEFAULT_FILE
 from deepracer_exp.tracking.calls import redacted_line
 from deepracer_exp.tracking.store import check_database_file
 
+from .pool import POOL, close_when_idle
+
 Result = TypeVar("Result")
 
 DOWN = (OperationalError, InterfaceError, InternalError, PoolTimeout, StorageInternalError)
@@ -67,15 +69,11 @@ class Database:
         return Path(str(self.url.database)) if self.url.get_backend_name() == "sqlite" else None
 
     def engine_options(self) -> dict[str, Any]:
-        """Return arguments of SQLAlchemy's `create_engine` besides the URL.
-
-        Each transaction on a server has its own connection. A pool would keep one or two connections per worker open
-        for hours, of which PostgreSQL allows 100 by default, and all of them would break when the server restarts.
-        """
+        """Return arguments of SQLAlchemy's `create_engine` besides the URL."""
         if self.file is not None:
             return {"connect_args": {"timeout": _STUCK_S}}
         if self.url.get_driver_name() not in ("psycopg", "psycopg2"):
-            return {"poolclass": sa.NullPool}
+            return dict(POOL)
         arguments = {
             "connect_timeout": _CONNECT_S,
             "keepalives_idle": 15,
@@ -85,7 +83,7 @@ class Database:
             "options": f"-c idle_in_transaction_session_timeout={_STUCK_S}s -c lock_timeout={_STUCK_S}s",
         }
         chosen = {key: value for key, value in arguments.items() if key not in self.url.query}
-        return {"poolclass": sa.NullPool, "connect_args": chosen}
+        return {**POOL, "connect_args": chosen}
 
     @contextmanager
     def creation_lock(self, engine: sa.Engine) -> Iterator[None]:
@@ -218,14 +216,17 @@ def _reason(error: BaseException) -> str:
 
 
 def _open(database: Database) -> RDBStorage:
-    probe = sa.create_engine(database.url, **database.engine_options() | {"poolclass": sa.NullPool})
-    if _is_ready(database, probe):
-        return _rdb(database, create=False)
-    with database.creation_lock(probe):
-        if database.file is not None:
-            _write_ahead(database.file)
-        # A process that was killed here leaves some of the tables: Optuna creates those that are missing.
-        return _rdb(database, create=True)
+    probe = sa.create_engine(database.url, **database.engine_options())
+    try:
+        if _is_ready(database, probe):
+            return _rdb(database, create=False)
+        with database.creation_lock(probe):
+            if database.file is not None:
+                _write_ahead(database.file)
+            # A process that was killed here leaves some of the tables: Optuna creates those that are missing.
+            return _rdb(database, create=True)
+    finally:
+        probe.dispose()
 
 
 def _write_ahead(file: Path) -> None:
@@ -258,6 +259,9 @@ def _rdb(database: Database, *, create: bool) -> RDBStorage:
     # Optuna formats the URL, so braces of a password or a folder are doubled.
     url = database.url.render_as_string(hide_password=False).replace("{", "{{").replace("}", "}}")
     try:
-        return RDBStorage(url, engine_kwargs=database.engine_options(), skip_table_creation=not create)
+        storage = RDBStorage(url, engine_kwargs=database.engine_options(), skip_table_creation=not create)
     except RuntimeError as error:
         raise BadInput(database.shown, redacted_line(error)) from None
+    if database.file is None:
+        close_when_idle(storage.engine)
+    return storage
