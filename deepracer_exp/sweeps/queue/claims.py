@@ -9,11 +9,8 @@ never becomes stale; and workers that ask for trials at the same moment exceed t
 """
 
 import json
-import logging
 import random
-import threading
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,16 +21,9 @@ from optuna.trial import TrialState
 from sqlalchemy.exc import DBAPIError, IntegrityError
 
 from deepracer_exp.sweeps.trial import SeedRun, Trial, as_runs, runs_as_json
-from deepracer_exp.training.callback import TakenOver
-
-from .storage import DOWN, patiently
-
-_log = logging.getLogger("deepracer_exp")
 
 TABLE = "deepracer_trials"
 _RELEASED = 0.0
-_RENEWALS = 12
-"""Renewals within one lease; the live view is at most one of them behind."""
 
 _table = sa.Table(
     TABLE,
@@ -63,6 +53,10 @@ _CLOCKS = {
 }
 
 
+Held = tuple[int, str, int]
+"""Number of a trial, its owner, and which of its owners that is, from 1."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Claim:
     """One row of the table: a trial, the worker that owns it, and what earlier owners left."""
@@ -82,6 +76,15 @@ class Claim:
         """Whether the trial has its result."""
         return self.trial.state != "RUNNING"
 
+    @property
+    def held(self) -> Held:
+        """What is held of the trial, by whom."""
+        return self.trial.number, self.owner, self.attempt
+
+    def is_final_as(self, number: int) -> bool:
+        """Return whether this is the claim of the trial of that number, and its row never changes again."""
+        return self.trial.number == number and self.has_ended and self.is_reported
+
 
 class TrialClaims:
     """The claims of one study.
@@ -94,6 +97,8 @@ class TrialClaims:
         """Create the table in the study's database if it is missing."""
         self.study = study
         self._engine = engine
+        self._final: list[Claim] = []
+        """The first claims, of the trials 0, 1, ..., whose rows never change again."""
         self._now = sa.literal_column(_CLOCKS[engine.dialect.name], sa.Double)
         if sa.inspect(engine).has_table(TABLE):
             return
@@ -135,6 +140,24 @@ class TrialClaims:
         """
         more = {} if progress is None else {_of.progress: json.dumps(dict(progress))}
         return self._update_held(claim, {_of.expires_s: self._now + lease_s, **more})
+
+    def renew_all(self, held: Mapping[Held, Mapping[str, Any] | None], lease_s: float) -> set[Held]:
+        """Restart the leases of several claims in one statement; return those that are still held.
+
+        Each has its progress as `renew` takes it. A lease that `release` has ended stays so: its owner is gone, however
+        late its last sign of life arrives.
+        """
+        progress = {
+            number: json.dumps(dict(shown)) for (number, *_), shown in held.items() if shown is not None
+        }
+        values: dict[Any, Any] = {_of.expires_s: self._now + lease_s}
+        if progress:
+            values[_of.progress] = sa.case(progress, value=_of.number, else_=_of.progress)
+        key = (_of.number, _of.owner, _of.attempt)
+        where = (sa.tuple_(*key).in_(list(held)), _is_held, _of.expires_s > _RELEASED)
+        with self._engine.begin() as connection:
+            renewed = connection.execute(self._statement(values, *where).returning(*key)).all()
+        return {(row.number, row.owner, row.attempt) for row in renewed}
 
     def record(
         self,
@@ -184,8 +207,12 @@ class TrialClaims:
         return len(mine)
 
     def all(self) -> list[Claim]:
-        """Return every claim ever made, by the number of the trial."""
-        return [_as_claim(row) for row in self._rows()]
+        """Return every claim ever made, by the number of the trial; what can have changed is read, and no more."""
+        final = self._final
+        claims = [*final, *map(_as_claim, self._rows(_of.number >= len(final)))]
+        while len(final) < len(claims) and claims[len(final)].is_final_as(len(final)):
+            final.append(claims[len(final)])
+        return claims
 
     def is_done(self, total: int) -> bool:
         """Return whether the first `total` trials have their results."""
@@ -264,69 +291,6 @@ class TrialClaims:
                 connection.execute(self._statement(values, *held))
             row = connection.execute(self._select(_of.number == claim.trial.number)).one()
         return (row.owner, row.attempt) == (claim.owner, claim.attempt) and settled == (row.state is not None)
-
-
-class Lease:
-    """Keeps a claim while its trial is made: a context that renews it from a thread and checks it before each write.
-
-    A process that was suspended for longer than its lease, and whose trial was taken over meanwhile, finds out by
-    `confirm`, which precedes everything that is written.
-    """
-
-    def __init__(self, claims: TrialClaims, claim: Claim, lease_s: float, patience_s: float):
-        """Hold a fresh claim, valid for `lease_s` seconds without renewal; a database may be away for `patience_s`."""
-        self.claim = claim
-        self._claims, self._lease_s, self._patience_s = claims, lease_s, patience_s
-        self.progress: Mapping[str, Any] = {}
-        """How far the trial is; the next renewal stores it."""
-        self._renewed_at = time.monotonic()
-        self._lost = False
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._keep, name="lease", daemon=True)
-
-    def __enter__(self) -> "Lease":
-        """Start to renew."""
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._over.set()
-        self._thread.join()
-
-    def confirm(self) -> None:
-        """Return while the claim is held.
-
-        Raises:
-            TakenOver: it is lost.
-            RunFailed: the database has not answered for too long.
-        """
-        if not self._lost and time.monotonic() > self._renewed_at + self._lease_s / 2:
-            self._lost = not patiently(self._renew, self._patience_s)
-        if self._lost:
-            raise TakenOver(f"trial {self.claim.trial.number} was taken over")
-
-    def held(self, write: Callable[[], bool]) -> None:
-        """Make a write that returns False if the claim is lost; raise as `confirm` does."""
-        if not patiently(write, self._patience_s):
-            self._lost = True
-        self.confirm()
-
-    def _renew(self) -> bool:
-        began = time.monotonic()
-        held = self._claims.renew(self.claim, self._lease_s, dict(self.progress) or None)
-        if held:
-            self._renewed_at = began
-        return held
-
-    def _keep(self) -> None:
-        while not self._over.wait(self._lease_s / _RENEWALS):
-            try:
-                if not self._renew():
-                    self._lost = True
-                    return
-            except DOWN as error:
-                # `confirm` waits for the database before anything is written.
-                _log.warning("lease of trial %d: %s", self.claim.trial.number, type(error).__name__)
 
 
 def report_results(claims: TrialClaims, storage: BaseStorage) -> None:

@@ -14,6 +14,7 @@ from deepracer_exp.training.signals import Interruption
 
 from .claims import Claim, TrialClaims
 from .launcher import LocalLauncher, LocalWorker
+from .lease import LeaseKeeper
 from .ray_launcher import RayLauncher, RayWorker
 from .storage import patiently
 from .worker_config import WorkerConfig, is_gone
@@ -65,26 +66,30 @@ class Driver:
         self._ended_before = frozenset(claim.trial.number for claim in claims if claim.has_ended)
         for owner in {claim.owner for claim in claims if not claim.has_ended and is_gone(claim.owner)}:
             self._release(owner)
-        try:
-            for _ in range(self._launcher.workers):
-                self._start()
-            while True:
-                claims = self._look()
-                self._show(claims, "")
-                if interruption.signum is not None:
-                    stage = "ending: running trials write their checkpoints"
-                    self._show(claims, stage)
-                    self._end()
-                    self._show(self._look(), stage)
-                    return interruption.exit_code
-                self._give_up_if_all_fail(claims)
-                self._replace_lost_workers()
-                if not self._running:
-                    return None
-                time.sleep(_LOOK_S)
-        except BaseException:
-            self._kill()
-            raise
+        with LeaseKeeper(self._claims, self._config.config.lease_s, lambda: [*self._running]):
+            try:
+                return self._make_trials(interruption)
+            except BaseException:
+                self._kill()
+                raise
+
+    def _make_trials(self, interruption: Interruption) -> int | None:
+        for _ in range(self._launcher.workers):
+            self._start()
+        while True:
+            claims = self._look()
+            self._show(claims, "")
+            if interruption.signum is not None:
+                stage = "ending: running trials write their checkpoints"
+                self._show(claims, stage)
+                self._end()
+                self._show(self._look(), stage)
+                return interruption.exit_code
+            self._give_up_if_all_fail(claims)
+            self._replace_lost_workers()
+            if not self._running:
+                return None
+            time.sleep(_LOOK_S)
 
     def _start(self) -> None:
         self._running.append(self._launcher.start(self._config, uuid.uuid4().hex[:8]))

@@ -5,6 +5,7 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -45,7 +46,8 @@ from deepracer_exp.training.run import copy_run, run_training
 from deepracer_exp.training.signals import Interruption
 from deepracer_exp.training.trainer import Trainer
 
-from .claims import Claim, Lease, TrialClaims, report_results
+from .claims import Claim, TrialClaims, report_results
+from .lease import Lease
 from .storage import patiently, resolve_database
 from .worker_config import WorkerConfig, plan_trial
 
@@ -70,9 +72,11 @@ class Interrupted(Exception):  # noqa: N818 - reads as what it is at the raise s
 class Worker:
     """Claims and makes trials of one study, and reports their results."""
 
-    def __init__(self, config: WorkerConfig, storage: RDBStorage, owner: str):
-        """Connect to the study; `owner` is this worker's name."""
-        self._config, self._storage, self._owner = config, storage, owner
+    def __init__(
+        self, config: WorkerConfig, storage: RDBStorage, owner: str, driver: Connection | None = None
+    ):
+        """Connect to the study; `owner` is this worker's name, and `driver` leads to what renews its leases."""
+        self._config, self._storage, self._owner, self._driver = config, storage, owner, driver
         self._claims = TrialClaims(storage.engine, config.study)
         self._database = resolve_database(config.config.storage, config.runs_dir)
         self._patience_s = config.config.patience_s
@@ -96,7 +100,8 @@ class Worker:
         self._patiently(lambda: self._claims.release(self._owner))
 
     def _make(self, claim: Claim) -> None:
-        with Lease(self._claims, claim, self._config.config.lease_s, self._patience_s) as lease:
+        lease_s = self._config.config.lease_s
+        with Lease(self._claims, claim, lease_s, self._patience_s, self._driver) as lease:
             try:
                 ended = self._ended(lease)
                 lease.held(lambda: self._claims.settle(claim, ended))
