@@ -42,7 +42,7 @@ from .queue.launcher import LocalLauncher
 from .queue.ray_launcher import RayLauncher
 from .queue.storage import open_storage, patiently, resolve_database
 from .queue.study import open_study
-from .queue.worker import Interrupted
+from .queue.trial_run import Interrupted
 from .queue.worker_config import Parent, WorkerConfig, plan_trial
 from .report.best import (
     FreshLaps,
@@ -165,7 +165,7 @@ def _run(
 
     def track(now: Sequence[Claim]) -> None:
         if study_run is not None:
-            study_run.update(_progress(now, worker_config.config, study))
+            study_run.update(progress_of(now, worker_config.config, study))
 
     with Interruption() as interruption, SweepView(worker_config, launcher.workers, console) as view:
         view.show(patiently(claims.all, patience_s))
@@ -185,7 +185,7 @@ def _run(
     return 0
 
 
-def _progress(claims: Sequence[Claim], config: SweepConfig, study: Study) -> Progress:
+def progress_of(claims: Sequence[Claim], config: SweepConfig, study: Study) -> Progress:
     """Return the progress of the study, for MLflow."""
     ended = [claim.trial for claim in claims if claim.has_ended]
     counts = collections.Counter(trial.state for trial in ended)

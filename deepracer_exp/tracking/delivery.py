@@ -80,7 +80,7 @@ def deliver_evaluation(
 
         run = MLflowRun(store)
         run.run_id = run_id
-        run.log_metrics(points_at(metrics, env_steps, now_ms()))
+        run.log(points_at(metrics, env_steps, now_ms()))
         for file, folder in files.items():
             run.log_artifact(file, folder)
     except (StoreRefusedError, StoreUnavailableError) as error:

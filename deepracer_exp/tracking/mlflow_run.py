@@ -8,7 +8,6 @@ request of a killed process that a slow server handles late does no harm either.
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -20,7 +19,7 @@ from mlflow.utils.validation import MAX_METRICS_PER_BATCH, MAX_PARAMS_TAGS_PER_B
 
 from deepracer_exp.addresses import without_passwords
 
-from .calls import StoreRefusedError, pages, store_errors
+from .calls import StoreRefusedError, Value, pages, store_errors
 from .metadata import (
     END_TAG,
     EXPERIMENT_TAGS,
@@ -67,25 +66,33 @@ class MLflowRun:
                 _create_whole(file)
             return client_of(self._store)
 
-    def open(self, tracked: TrackedRun) -> None:
-        """Create the run, or continue it if the store has it already, with or without an answer that said so."""
+    def open(self, tracked: TrackedRun, *, is_first: bool = False) -> None:
+        """Create the run, or continue it if the store has it already, with or without an answer that said so.
+
+        `is_first`: nobody has tried to create it before.
+        """
         self.run_id = tracked.run_id
         with store_errors():
             if self.run_id is None:
                 experiment_id = self._experiment_id(tracked.experiment)
-                self.run_id = self._find(experiment_id, tracked)
+                self.run_id = None if is_first else self._find(experiment_id, tracked)
             if self.run_id is None:
                 self.run_id = self._create(experiment_id, tracked)
                 return
-            run = self._client.get_run(self.run_id)
-            if run.info.lifecycle_stage != "active":
-                raise StoreRefusedError(f"run {self.run_id} was deleted in MLflow; restore it there")
+            self.read(self.run_id)
             self._client.update_run(self.run_id, status="RUNNING")
-            self._params, self._tags, self.metrics = run.data.params, run.data.tags, run.data.metrics
             if END_TAG in self._tags and END_TAG not in tracked.tags:
                 self._client.delete_tag(self.run_id, END_TAG)
                 del self._tags[END_TAG]
-        self._is_new = False
+
+    def read(self, run_id: str) -> None:
+        """Read a run of the store, which stays as it is, ended or not."""
+        with store_errors():
+            run = self._client.get_run(run_id)
+        if run.info.lifecycle_stage != "active":
+            raise StoreRefusedError(f"run {run_id} was deleted in MLflow; restore it there")
+        self.run_id, self._is_new = run_id, False
+        self._params, self._tags, self.metrics = run.data.params, run.data.tags, run.data.metrics
 
     def open_only(self, tracked: TrackedRun, mark: Sequence[str]) -> None:
         """Create a run, or continue the oldest one of its experiment that has the same values of the tags `mark`.
@@ -105,14 +112,6 @@ class MLflowRun:
                 self._client.delete_run(self.run_id)
         self.open(replace(tracked, run_id=oldest))
 
-    def log_params(self, params: Mapping[str, str]) -> None:
-        """Write the parameters that the store lacks."""
-        rest = iter([(key, value) for key, value in params.items() if key not in self._params])
-        with store_errors():
-            while some := dict(islice(rest, MAX_PARAMS_TAGS_PER_BATCH)):
-                self._client.log_batch(self.run_id, params=[Param(*item) for item in some.items()])
-                self._params |= some
-
     def lacking(self, points: Sequence[Point]) -> list[Point]:
         """Return the points of which the store has none of the same metric and step."""
         with store_errors():
@@ -121,24 +120,34 @@ class MLflowRun:
                 self._steps[key] = {point.step for point in history}
         return [point for point in points if point[-1] not in self._steps[point[0]]]
 
-    def log_metrics(self, points: Sequence[Point]) -> None:
-        """Write points."""
+    def log(
+        self,
+        points: Sequence[Point] = (),
+        params: Mapping[str, str] | None = None,
+        tags: Mapping[str, str] | None = None,
+    ) -> None:
+        """Write points, and what the store lacks of parameters and tags, in one request if it takes that many."""
+        left = list(points)
+        # A parameter never changes in MLflow.
+        new_params = [item for item in (params or {}).items() if item[0] not in self._params]
+        whole = {key: value[:MAX_TAG_VAL_LENGTH] for key, value in (tags or {}).items()}
+        new_tags = [item for item in whole.items() if self._tags.get(item[0]) != item[1]]
         with store_errors():
-            for start in range(0, len(points), MAX_METRICS_PER_BATCH):
-                some = points[start : start + MAX_METRICS_PER_BATCH]
-                self._client.log_batch(self.run_id, metrics=[Metric(*point) for point in some])
+            while left or new_params or new_tags:
+                some_params, new_params = _split(new_params, MAX_PARAMS_TAGS_PER_BATCH)
+                some_tags, new_tags = _split(new_tags, MAX_PARAMS_TAGS_PER_BATCH)
+                some, left = _split(left, MAX_METRICS_PER_BATCH - len(some_params) - len(some_tags))
+                self._client.log_batch(
+                    self.run_id,
+                    [Metric(*point) for point in some],
+                    [Param(*param) for param in some_params],
+                    [RunTag(*tag) for tag in some_tags],
+                )
+                self._params |= dict(some_params)
+                self._tags |= dict(some_tags)
                 for key, value, _, step in some:
                     self._steps.setdefault(key, set()).add(step)
                     self.metrics[key] = value
-
-    def set_tags(self, tags: Mapping[str, str]) -> None:
-        """Write the tags that are not as they should be."""
-        whole = {key: value[:MAX_TAG_VAL_LENGTH] for key, value in tags.items()}
-        rest = iter([(key, value) for key, value in whole.items() if self._tags.get(key) != value])
-        with store_errors():
-            while some := dict(islice(rest, MAX_PARAMS_TAGS_PER_BATCH)):
-                self._client.log_batch(self.run_id, tags=[RunTag(*item) for item in some.items()])
-                self._tags |= some
 
     def set_experiment_tags(self, tags: Mapping[str, str]) -> None:
         """Write tags of the run's experiment."""
@@ -162,15 +171,15 @@ class MLflowRun:
 
         `files` are the names of those that the store has. An edited description is kept.
         """
+        points: list[Point] = []
         if best := summary.get("best"):
             end_ms = tracked.end_ms or tracked.start_ms
-            self.log_metrics(self.lacking(points_at(best_metrics(summary), best["env_steps"], end_ms)))
+            points = self.lacking(points_at(best_metrics(summary), best["env_steps"], end_ms))
         with store_errors():
             run = self._client.get_run(self.run_id)
             begun, now = tracked.tags.get(NOTE, ""), run.data.tags.get(NOTE, "")
-            if now.endswith(begun):
-                note = result_note(summary, run.info.run_id, files)
-                self._client.set_tag(self.run_id, NOTE, f"{note}\n\n{begun}"[:MAX_TAG_VAL_LENGTH])
+            note = f"{result_note(summary, run.info.run_id, files)}\n\n{begun}"
+            self.log(points, tags={NOTE: note} if now.endswith(begun) else {})
             self._describe_experiment(run.info.experiment_id)
 
     def describe_study(self, winner: str) -> None:
@@ -252,6 +261,10 @@ class MLflowRun:
     def _oldest(self, experiment_id: str, tags: Mapping[str, str]) -> str | None:
         runs = self._client.search_runs([experiment_id], _with(tags), ViewType.ACTIVE_ONLY)
         return min(((run.info.start_time, run.info.run_id) for run in runs), default=(0, None))[1]
+
+
+def _split(items: list[Value], most: int) -> tuple[list[Value], list[Value]]:
+    return items[:most], items[most:]
 
 
 def _with(tags: Mapping[str, str]) -> str:

@@ -7,6 +7,8 @@ from pathlib import Path
 
 from typing_extensions import override
 
+from deepracer_exp.runs.files import TRACKING
+
 from .metadata import END_TAG
 from .metrics import now_ms, points_of
 from .projection import MLflowProjection
@@ -45,8 +47,9 @@ class MLflowTracker(Tracker):
     def open(self, folder: Path, run: TrackedRun) -> None:
         tags = {key: value for key, value in run.tags.items() if key != END_TAG}
         again = replace(run, status=None, end_ms=None, complete=False, tags=tags)
+        is_new = not (folder / TRACKING).exists()
         self._file = TrackingFile(folder, again, self._store.shown)
-        self._projection = MLflowProjection(self._store, self._file)
+        self._projection = MLflowProjection(self._store, self._file, is_new=is_new)
         self._thread = StoreThread(self._projection.update, self._store.shown, "the training continues")
 
     @override

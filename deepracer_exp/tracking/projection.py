@@ -5,6 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.checkpoint_files import LINKS, restore_links
 from deepracer_exp.runs.files import (
     BEST_LAP,
@@ -58,12 +59,13 @@ class MLflowProjection:
         written: number of points of metrics.jsonl that were written.
     """
 
-    def __init__(self, store: Store, file: TrackingFile) -> None:
-        """Project the folder of a tracking.json to a store."""
+    def __init__(self, store: Store, file: TrackingFile, *, is_new: bool = False) -> None:
+        """Project the folder of a tracking.json to a store; `is_new`: nobody has tried to create the run there."""
         self.beside: list[Point] = []
         self.written = 0
         self._store, self._file, self._folder = store, file, file.folder
         self._run: MLflowRun | None = None
+        self._is_new = is_new
         self._rows = 0
         """Number of rows of metrics.jsonl that MLflow has."""
         self._files: set[tuple[Path, str | None]] = set()
@@ -82,35 +84,54 @@ class MLflowProjection:
         except StoreRefusedError as error:
             return {"the run": str(error)}
         tracked = self._file.run
+        refused = self._write_values(run)
+        if tracked.status is None:
+            return refused
+        files = files_to_keep(self._folder)
         writes: dict[str, Callable[[], object]] = {
-            "the parameters": lambda: run.log_params(tracked.params),
-            "metrics": lambda: self._write_metrics(run),
-            "the tags": lambda: run.set_tags(self._tags()),
+            f"file {path}": partial(self._write_file, run, path, folder) for path, folder in files
         }
-        if tracked.status is not None:
-            files = files_to_keep(self._folder)
-            writes |= {f"file {path}": partial(self._write_file, run, path, folder) for path, folder in files}
-            writes["the result"] = lambda: self._conclude(run, {path.name for path, _ in files})
-            writes["the end"] = partial(run.end, tracked.status, tracked.end_ms or now_ms())
-        return refused_of(writes)
+        writes["the result"] = lambda: self._conclude(run, {path.name for path, _ in files})
+        writes["the end"] = partial(run.end, tracked.status, tracked.end_ms or now_ms())
+        return {**refused, **refused_of(writes)}
+
+    def _write_values(self, run: "MLflowRun") -> Mapping[str, str]:
+        """Write parameters, metrics and tags in one request; one after the other where the store refuses that."""
+        params = self._file.run.params
+        try:
+            self._write_metrics(run, params, self._tags())
+            return {}
+        except (BadInput, StoreRefusedError):
+            return refused_of(
+                {
+                    "the parameters": lambda: run.log(params=params),
+                    "metrics": lambda: self._write_metrics(run),
+                    "the tags": lambda: run.log(tags=self._tags()),
+                }
+            )
 
     def _opened(self) -> "MLflowRun":
         from .mlflow_run import MLflowRun
 
         if self._run is None:
             run = MLflowRun(self._store)
-            run.open(self._file.run)
+            is_first, self._is_new = self._is_new, False
+            run.open(self._file.run, is_first=is_first)
             self._file.change(run_id=run.run_id)
             self._run = run
         return self._run
 
-    def _write_metrics(self, run: "MLflowRun") -> None:
+    def _write_metrics(
+        self, run: "MLflowRun", params: Mapping[str, str] | None = None, tags: Mapping[str, str] | None = None
+    ) -> None:
+        """Write the rows that a checkpoint covers, with parameters and tags."""
         covered, beside = self._covered(), list(self.beside)
         if covered <= self._rows and not self._is_over:
+            run.log(params=params, tags=tags)
             return
         # The last row is read again: it gets an evaluation when the run ends.
         lacking = run.lacking(self._points(max(self._rows - 1, 0)))
-        run.log_metrics([*lacking, *run.lacking(beside)])
+        run.log([*lacking, *run.lacking(beside)], params, tags)
         del self.beside[: len(beside)]
         self._rows = covered
         self.written += len(lacking)

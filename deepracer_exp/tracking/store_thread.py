@@ -13,8 +13,8 @@ from .calls import StoreRefusedError, StoreUnavailableError
 
 _log = logging.getLogger(__name__)
 
-UPDATE_S = 3.0
-"""Pause between two updates of a store that answers."""
+UPDATE_S = 5.0
+"""Pause between two updates of a store that answers; what has come up meanwhile is one request."""
 _LONGEST_PAUSE_S = 10.0
 """Longest pause while the store does not answer; pauses grow until then."""
 _LAST_PAUSE_S = 0.5

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from .calls import StoreRefusedError, StoreUnavailableError, ended_within
 from .metadata import END_TAG, NOTE, PARENT, STUDY, param_text, study_view, user_tags
-from .metrics import now_ms, points_at, trial_metrics
+from .metrics import Point, now_ms, points_at, trial_metrics
 from .store import Store
 from .store_thread import StoreThread, refused_of
 from .tracking_file import Status, TrackedRun
@@ -148,7 +148,7 @@ class StudyRun:
         if self._run is None:
             run = MLflowRun(self._store)
             run.open_only(self._tracked, (STUDY, SEARCH, KIND))
-            run.log_params(self._tracked.params)
+            run.log(params=self._tracked.params)
             self._run = run
             self._settled.set()
         return self._run
@@ -176,17 +176,16 @@ class StudyRun:
         )
         counts = ("complete", "pruned", "failed", "env_steps")
         metrics |= {f"study/{name}": getattr(progress, name) for name in counts}
-        run.set_tags(tags)
-        if progress.best_trial is not None:
-            run.describe_study(f"trial {progress.best_trial}, {progress.best_shown}")
         points = points_at(metrics, progress.ended, now_ms())
         # Also when no trial has ended since: in the end another one may be the best.
-        if any(run.metrics.get(key) != value for key, value, *_ in points):
-            run.log_metrics(points)
+        run.log(points if _is_news(run, points) else (), tags=tags)
+        if progress.best_trial is not None:
+            run.describe_study(f"trial {progress.best_trial}, {progress.best_shown}")
         self._written = progress
 
     def _end(self, run: "MLflowRun", status: Status) -> None:
-        _end(run, status, _ENDS[status])
+        run.log(tags={END_TAG: _ENDS[status]})
+        run.end(status, now_ms())
         self._is_ended = True
 
     def _note(self, progress: Progress) -> str:
@@ -220,27 +219,28 @@ def open_trial_run(
 
     def open_run(run: "MLflowRun") -> None:
         run.open_only(tracked, (STUDY, KIND, TRIAL, PARENT))
-        run.log_params(tracked.params)
+        run.log(params=tracked.params)
 
     return _within(deadline_s, store, f"trial {trial} has no run there", open_run)
 
 
 def end_trial_run(
-    store: Store, study: str, run_id: str, status: Status, reason: str, values: Mapping[str, float | None]
+    store: Store, run_id: str, status: Status, reason: str, values: Mapping[str, float | None]
 ) -> None:
-    """End the run of a trial with its values by metric; errors are logged."""
+    """End the run of a trial, or change how it has ended, with its values by metric; errors are logged."""
 
     def end_run(run: "MLflowRun") -> None:
-        run.open(TrackedRun("", study, 0, run_id=run_id))
-        run.log_metrics(run.lacking(points_at(values, 0, now_ms())))
-        _end(run, status, reason)
+        run.read(run_id)
+        points = points_at(values, 0, now_ms())
+        run.log(points if _is_news(run, points) else (), tags={END_TAG: reason})
+        run.end(status, now_ms())
 
     _within(30.0, store, f"run {run_id} was not ended there", end_run)
 
 
-def _end(run: "MLflowRun", status: Status, reason: str) -> None:
-    run.set_tags({END_TAG: reason})
-    run.end(status, now_ms())
+def _is_news(run: "MLflowRun", points: Sequence[Point]) -> bool:
+    """Return whether one of the points has a value that is not the newest of its metric."""
+    return any(run.metrics.get(key) != value for key, value, *_ in points)
 
 
 def _within(deadline_s: float, store: Store, failure: str, call: "Callable[[MLflowRun], None]") -> str | None:

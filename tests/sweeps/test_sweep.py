@@ -17,7 +17,7 @@ from deepracer_exp.runs.files import read_object
 from deepracer_exp.sweeps.queue.claims import Claim
 from deepracer_exp.sweeps.queue.driver import Driver
 from deepracer_exp.sweeps.queue.storage import open_storage
-from deepracer_exp.sweeps.queue.worker import Interrupted
+from deepracer_exp.sweeps.queue.trial_run import Interrupted
 from deepracer_exp.sweeps.queue.worker_config import Parent
 from deepracer_exp.sweeps.search.space import SearchSpace
 from deepracer_exp.sweeps.sweep import _conclude, _parent, _without_rules, begin_study_run, interval_of

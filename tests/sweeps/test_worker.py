@@ -13,7 +13,8 @@ from deepracer_exp.config.sweep import compose_sweep
 from deepracer_exp.sweeps.queue.claims import TrialClaims
 from deepracer_exp.sweeps.queue.storage import open_storage
 from deepracer_exp.sweeps.queue.study import open_study
-from deepracer_exp.sweeps.queue.worker import TrialRun, Worker
+from deepracer_exp.sweeps.queue.trial_run import TrialRun
+from deepracer_exp.sweeps.queue.worker import Worker
 from deepracer_exp.sweeps.queue.worker_config import WorkerConfig
 from deepracer_exp.sweeps.search.space import SearchSpace
 from deepracer_exp.sweeps.trial import Trial

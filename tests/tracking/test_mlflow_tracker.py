@@ -4,17 +4,20 @@ import socket
 import sqlite3
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 from mlflow import MlflowClient
 
+from deepracer_exp.tracking import store_thread
 from deepracer_exp.tracking.metadata import param_text
-from deepracer_exp.tracking.metrics import metric_name
+from deepracer_exp.tracking.metrics import metric_name, now_ms
 from deepracer_exp.tracking.mlflow_run import MLflowRun
 from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
+from deepracer_exp.tracking.projection import MLflowProjection
 from deepracer_exp.tracking.store import resolve_store
-from deepracer_exp.tracking.tracking_file import TrackedRun
+from deepracer_exp.tracking.tracking_file import TrackedRun, TrackingFile
 
 from .conftest import begin, points, write_rows
 
@@ -77,10 +80,59 @@ def test_repeating_a_call_changes_nothing(store, mlflow):
         one.open(tracked)
     assert repeated.run_id == run.run_id
     for _ in range(2):
-        run.log_params({"seed": "1"})
-        run.log_metrics([("update/kl", 0.5, 1000, 7), ("update/kl", 0.25, 2000, 8)])
+        run.log([("update/kl", 0.5, 1000, 7), ("update/kl", 0.25, 2000, 8)], {"seed": "1"})
         run.end("FINISHED", 2345)
     assert points(mlflow, run.run_id, "kl") == [(7, 0.5), (8, 0.25)]
+
+
+@pytest.fixture
+def batches(monkeypatch) -> list[tuple[int, int, int]]:
+    """How many metrics, parameters and tags each request to write values had."""
+    sent = []
+    log_batch = MlflowClient.log_batch
+
+    def log(self, run_id, metrics=(), params=(), tags=(), **options):
+        sent.append((len(metrics), len(params), len(tags)))
+        return log_batch(self, run_id, metrics, params, tags, **options)
+
+    monkeypatch.setattr(MlflowClient, "log_batch", log)
+    return sent
+
+
+def test_all_that_has_come_up_is_one_request(store, batches, tmp_path):
+    write_rows(tmp_path, [{"kl": 1.0, "lr": 0.1}] * 90)
+    run = TrackedRun("run", "race", now_ms(), params={"seed": "1", "track": "oval"}, tags={"half": "done"})
+    file = TrackingFile(tmp_path, run, store.shown)
+    projection = MLflowProjection(store, file, is_new=True)
+    assert projection.update() == {}
+    assert batches == [(90 * 4, 2, 0)]  # with iteration and clock; a new run has its tags
+    assert projection.update() == {}
+    file.add_tag("half", "won")
+    write_rows(tmp_path, [{"kl": 1.0, "lr": 0.1}])
+    assert projection.update() == {}
+    assert batches[1:] == [(4, 0, 1)]
+
+
+def test_a_run_is_written_to_no_more_often_than_every_few_seconds(
+    store, batches, monkeypatch, wait_until, tmp_path
+):
+    monkeypatch.setattr(store_thread, "UPDATE_S", 0.4)
+    began = time.monotonic()
+    tracker = MLflowTracker(store)
+    begin(tracker, tmp_path)
+    for number in range(40):
+        write_rows(tmp_path, [{"kl": float(number)}])
+        time.sleep(0.05)
+    wait_until(lambda: sum(metrics for metrics, *_ in batches) == 40 * 3)
+    assert len(batches) <= 1 + (time.monotonic() - began) / 0.4
+
+
+def test_a_parameter_that_is_refused_costs_no_metric(store, mlflow, tmp_path):
+    write_rows(tmp_path, [{"kl": 0.5}])
+    run = TrackedRun("run", "race", now_ms(), params={"seed": "1", "?!": "1"}, tags={"half": "done"})
+    file = TrackingFile(tmp_path, run, store.shown)
+    assert [*MLflowProjection(store, file).update()] == ["the parameters"]
+    assert points(mlflow, file.run.run_id, "kl") == [(100, 0.5)]
 
 
 def test_a_run_deleted_in_the_ui_costs_one_line_and_nothing_else(

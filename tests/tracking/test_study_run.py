@@ -164,7 +164,7 @@ def test_the_seeds_of_a_trial_share_one_parent_run(store, mlflow):
     ids = {open_trial_run(store, "spring", 7, parent, ["algorithm.lr=0.001"]) for _ in range(2)}
     other = open_trial_run(store, "spring", 8, parent, ["algorithm.lr=0.002"])
     (run_id,) = ids
-    end_trial_run(store, "spring", run_id, "FINISHED", "finished: converged", {"trial/lap_time_s": 9.1})
+    end_trial_run(store, run_id, "FINISHED", "finished: converged", {"trial/lap_time_s": 9.1})
     study.finish("FINISHED", 60)
     found = {run.info.run_id: run for run in runs_of(mlflow, "spring")}
     assert set(found) == {parent, run_id, other}

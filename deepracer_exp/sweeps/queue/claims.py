@@ -295,9 +295,9 @@ class TrialClaims:
 
 def report_results(claims: TrialClaims, storage: BaseStorage) -> None:
     """Report to Optuna the results it does not have yet; the worker of one may have been killed before it could."""
-    study_id = storage.get_study_id_from_name(claims.study)
     for claim in claims.unreported():
         trial = claim.trial
+        study_id = storage.get_study_id_from_name(claims.study)
         trial_id = storage.get_trial_id_from_study_id_trial_number(study_id, trial.number)
         try:
             for key, value in {**trial.attributes(), "attempt": claim.attempt}.items():
