@@ -5,6 +5,7 @@ waits: it appends the rows of a real run to its metrics.jsonl, one a second, mov
 and leaves the files of the real run. A worker is a thread with connections of its own; some processes share them all.
 """
 
+import contextlib
 import itertools
 import json
 import multiprocessing
@@ -278,7 +279,8 @@ class SimulatedWorker:
 
     def answer(self, answer: Answer) -> None:
         """Answer that."""
-        self._line.send(answer)
+        with contextlib.suppress(OSError):
+            self._line.send(answer)
 
     def terminate(self) -> None:
         """Ask it to end."""
