@@ -52,7 +52,7 @@ _LATE_S = 2 * UPDATE_S
 """A row that is not in MLflow this long after its checkpoint is late."""
 _EVERY = 10
 """Iterations between two evaluations of the default experiment."""
-_WORKERS_A_PROCESS = 125
+_WORKERS_A_PROCESS = 25
 _CALLS = (
     *("transaction", "renewal of all leases", "live table"),
     *("log_batch", "other request", "row until it is in MLflow", "end of a run"),
@@ -270,8 +270,8 @@ class Used:
         self._storage = storage
         here = [psutil.Process(), *(psutil.Process(one.pid) for one in launcher.processes)]
         self._processes = {
-            "PostgreSQL": listeners(host_and_port(args.storage, 5432)[1]),
-            "MLflow": listeners(host_and_port(args.tracking, 80)[1]),
+            "PostgreSQL": [server(host_and_port(args.storage, 5432)[1], "postgres")],
+            "MLflow": [server(host_and_port(args.tracking, 80)[1], "mlflow server")],
             "simulated workers": here,
         }
         self._began = time.monotonic()
@@ -306,12 +306,18 @@ class Used:
             return int(connection.execute(sa.text(question)).scalar_one())
 
 
-def listeners(port: int) -> list[psutil.Process]:
-    """Return the processes that listen on a port of this machine, and those they have started."""
-    found = {one.pid for one in psutil.net_connections("tcp") if one.laddr and one.laddr.port == port}
-    pids = {one.pid for one in psutil.net_connections("tcp") if one.status == psutil.CONN_LISTEN} & found
-    processes = [psutil.Process(pid) for pid in pids if pid]
-    return [one for one in processes if not {parent.pid for parent in one.parents()} & pids]
+def server(port: int, program: str) -> psutil.Process:
+    """Return the process of this machine that has started those which listen on a port."""
+    listening = next(
+        one.pid
+        for one in psutil.net_connections("tcp")
+        if one.status == psutil.CONN_LISTEN and one.laddr.port == port and one.pid
+    )
+    first = psutil.Process(listening)
+    for parent in first.parents():
+        if program in " ".join(parent.cmdline()):
+            first = parent
+    return first
 
 
 def cpu_s(process: psutil.Process) -> float:
@@ -333,23 +339,25 @@ def main() -> None:
     parser.add_argument("--tracking", required=True, help="an MLflow server")
     parser.add_argument("--trials", type=int, default=2, help="of the real sweep")
     parser.add_argument("--iterations", type=int, default=20, help="of each of its trials")
+    parser.add_argument("--run", type=Path, help="a run of an earlier sweep, in place of the real sweep")
     parser.add_argument("--workers", type=int, nargs="+", default=(100, 250, 500, 1000), help="of the loads")
-    parser.add_argument("--warmup-s", type=float, default=40.0)
+    parser.add_argument("--warmup-s", type=float, default=60.0)
     parser.add_argument("--measure-s", type=float, default=120.0)
     args = parser.parse_args()
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     with tempfile.TemporaryDirectory() as work:
         folder = Path(work)
-        run, demanded = real_sweep(args, folder)
-        rows = [
-            [f"{part} {name}", number(value / args.trials)]
-            for part in ("database", "mlflow", "disk")
-            for name, value in demanded[part].items()
-        ]
-        print(table([f"of a trial of {args.iterations} iterations", ""], rows), flush=True)
-        loads = []
+        demanded, loads = dict[str, Any](), list[dict[str, Any]]()
+        if args.run is None:
+            args.run, demanded = real_sweep(args, folder)
+            rows = [
+                [f"{part} {name}", number(value / args.trials)]
+                for part in ("database", "mlflow", "disk")
+                for name, value in demanded[part].items()
+            ]
+            print(table([f"of a trial of {args.iterations} iterations", ""], rows), flush=True)
         for workers in args.workers:
-            loads.append(load(args, folder / "runs", Template(run, 100, _EVERY), workers))
+            loads.append(load(args, folder / "runs", Template(args.run, 100, _EVERY), workers))
             print(f"\n{shown(loads[-1])}", flush=True)
             write_json(args.json, {"trials": args.trials, "sweep": demanded, "loads": loads})
 

@@ -1,7 +1,7 @@
 """A run's MLflow run as a projection of the run's folder: one function brings it up to date."""
 
 from collections.abc import Callable, Collection, Mapping
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -142,12 +142,17 @@ class MLflowProjection:
         rows = read_metrics(file) if file.exists() else []
         if not self._is_over:
             # The last policy of an interrupted run is evaluated out of turn, and a resumed run removes that again.
-            every = (read_config(self._folder).get("checkpoints") or {}).get("every")
             rows = [
-                row if every and row["iteration"] % every == 0 else without_evaluation(row)
+                row if self._every and row["iteration"] % self._every == 0 else without_evaluation(row)
                 for row in rows[: self._covered()]
             ]
         return [point for row in rows[first:] for point in points_of(row, row["env_steps"], start_ms)]
+
+    @cached_property
+    def _every(self) -> int | None:
+        """Iterations between two evaluations; reading a config takes longer than reading the rows of a run."""
+        every: int | None = (read_config(self._folder).get("checkpoints") or {}).get("every")
+        return every
 
     @property
     def _is_over(self) -> bool:
