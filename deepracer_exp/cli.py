@@ -17,6 +17,7 @@ from deepracer_exp import __version__
 from deepracer_exp.addresses import redact, without_passwords
 from deepracer_exp.commands import actions, analyze, compare, evaluate, files, runs, tracks, train
 from deepracer_exp.errors import BadInput, RunFailed, nearest
+from deepracer_exp.lean_imports import import_lean
 from deepracer_exp.lifeline import die_with_parent, guard_imports
 from deepracer_exp.scratch import own_scratch
 
@@ -42,6 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     words = without_passwords(list(sys.argv[1:] if arguments is None else arguments))
     if arguments is None:
         guard_imports()
+        import_lean()
         sys.argv[1:] = words  # the run's folder keeps them
     try:
         args = parse(words)

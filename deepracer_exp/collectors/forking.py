@@ -13,7 +13,8 @@ def start_workers_early(wanted: bool, module: str = "deepracer_exp.collectors.wo
     from multiprocessing import forkserver
 
     multiprocessing.set_start_method("forkserver", force=True)
-    multiprocessing.set_forkserver_preload(["deepracer_exp.collectors.fork_server", module])
+    package = "deepracer_exp.collectors"
+    multiprocessing.set_forkserver_preload([f"{package}.fork_server", module, f"{package}.fork_ready"])
     # Workers share the cores among themselves already; a linear-algebra thread pool in each would only compete.
     before = os.environ.get("OMP_NUM_THREADS")
     os.environ["OMP_NUM_THREADS"] = "1"

@@ -23,7 +23,7 @@ _log = logging.getLogger(__name__)
 class MLflowTracker(Tracker):
     """Records one run in MLflow from its folder, whose metrics.jsonl has the rows and whose tracking.json the tags.
 
-    So `log`, `safe_until` and `log_artifact` have nothing to do.
+    So `safe_until` and `log_artifact` have nothing to do, and `log` only lets the thread begin.
     """
 
     def __init__(self, store: Store) -> None:
@@ -51,6 +51,10 @@ class MLflowTracker(Tracker):
         self._file = TrackingFile(folder, again, self._store.shown)
         self._projection = MLflowProjection(self._store, self._file, is_new=is_new)
         self._thread = StoreThread(self._projection.update, self._store.shown, "the training continues")
+
+    @override
+    def log(self, metrics: Mapping[str, float | None], step: int) -> None:
+        self._thread.begin()
 
     @override
     def log_machine(self, use: Mapping[str, float], step: int) -> None:

@@ -33,7 +33,7 @@ class StoreThread:
     """
 
     def __init__(self, update: Callable[[], Mapping[str, str]], shown: str, meanwhile: str) -> None:
-        """Start the thread.
+        """Start the thread, which waits for `begin`, but not longer than until the second update would be due.
 
         `update` brings the store up to date and returns what the store refused, with the reasons; it raises
         StoreUnavailableError. `shown` is the address of the store, without password, and `meanwhile` says what
@@ -46,21 +46,28 @@ class StoreThread:
         self._logged: set[str] = set()
         self._is_outage_logged = False
         self._end_by = math.inf
+        self._may_begin = threading.Event()
         self._is_ending = threading.Event()
         # Daemon: a hanging store must not keep the process of a finished training alive.
         self._thread = threading.Thread(target=self._work, name="mlflow", daemon=True)
         self._thread.start()
 
+    def begin(self) -> None:
+        """Let the first update begin: it imports MLflow, for a second of a core that a start needs itself."""
+        self._may_begin.set()
+
     def finish(self, deadline_s: float) -> bool:
         """Update a last time, for at most `deadline_s`; return whether the store answered."""
         self._end_by = time.monotonic() + deadline_s
         self._is_ending.set()
+        self._may_begin.set()
         self._thread.join(deadline_s)
         return self._is_complete
 
     def _work(self) -> None:
         # Jitter, so that processes that began to wait together do not return together.
         pause_s, dice = 0.1, random.Random()
+        self._may_begin.wait(UPDATE_S)
         while time.monotonic() < self._end_by:
             is_last = self._is_ending.is_set()
             try:

@@ -96,6 +96,7 @@ class StudyRun:
         self._is_shown, self._is_ended = False, False
         self._settled = threading.Event()
         self._thread = StoreThread(self._update, store.shown, "the sweep continues")
+        self._thread.begin()
 
     def wait_for_id(self, deadline_s: float = 30.0) -> str | None:
         """Return the run's id in MLflow; None if the store refuses or does not answer in time."""

@@ -1,0 +1,14 @@
+"""Imported last by the fork server, and by nothing else: what the first compiled call in a process costs is paid here.
+
+numba then loads what all its functions need, a third of a second, which the server does while the training process
+imports; each worker would do it while the training waits.
+"""
+
+import gc
+
+import numpy as np
+
+from deepracer_exp.tracks.segments import build_segments
+
+build_segments(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.0, 0.0]]))
+gc.freeze()  # a collection in a worker would copy the server's memory
