@@ -25,7 +25,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -129,26 +129,32 @@ def has_trial(folder: Path) -> bool:
 def packages(python: Path, overrides: Sequence[str], folder: Path) -> list[Package]:
     """Train in one process and return what it imported, the package with the most seconds first."""
     line = [str(python), "-X", "importtime", str(python.with_name("deepracer-exp")), *_TRAINING]
-    found: dict[str, Package] = {}
-    began, is_later = time.monotonic(), False
+    pipes: dict[str, Any] = {
+        "stdin": subprocess.DEVNULL,
+        "stdout": subprocess.DEVNULL,
+        "stderr": subprocess.PIPE,
+    }
     with subprocess.Popen(
-        [*line, "collector=in_process", *overrides],
-        cwd=folder,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
+        [*line, "collector=in_process", *overrides], cwd=folder, text=True, **pipes
     ) as process:
         assert process.stderr is not None
-        for text in process.stderr:
-            is_later |= _FIRST_ITERATION in text
-            if match := _LINE.match(text):
-                name = match[2].partition(".")[0]
-                package = found.setdefault(name, Package(name, time.monotonic() - began, is_later))
-                package.modules += 1
-                package.seconds += int(match[1]) / 1e6
+        found = packages_of(process.stderr)
     if process.returncode:
         raise SystemExit(f"{' '.join(line)}: exit code {process.returncode}")
+    return found
+
+
+def packages_of(lines: Iterable[str]) -> list[Package]:
+    """Return the packages that a training imports, the one with the most seconds first; the lines come as it runs."""
+    found: dict[str, Package] = {}
+    began, is_later = time.monotonic(), False
+    for line in lines:
+        is_later |= _FIRST_ITERATION in line
+        if match := _LINE.match(line):
+            name = match[2].partition(".")[0]
+            package = found.setdefault(name, Package(name, time.monotonic() - began, is_later))
+            package.modules += 1
+            package.seconds += int(match[1]) / 1e6
     return sorted(found.values(), key=lambda package: -package.seconds)
 
 

@@ -84,3 +84,23 @@ print(bool(segments._candidates.signatures), gc.get_freeze_count() > 0)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["True", "True"]
+
+
+def test_a_sweep_starts_its_workers_before_it_imports_pytorch(tmp_path):
+    code = """
+import sys
+from deepracer_exp.cli import main
+from deepracer_exp.sweeps import sweep
+
+def run(driver, interruption):
+    print("torch" in sys.modules)
+    return 130
+
+sweep.Driver.run = run
+main(["sweep", "experiment=tiny", "algorithm.lr=1e-3,1e-4", "tracking=off"])
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 130, done.stderr
+    assert done.stdout.splitlines()[0] == "False"

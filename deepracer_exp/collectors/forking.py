@@ -5,8 +5,11 @@ import signal
 import sys
 
 
-def start_workers_early(wanted: bool, module: str = "deepracer_exp.collectors.worker") -> None:
-    """Start the server that workers are forked from; it imports torch, in `module`, while this process does."""
+def start_workers_early(wanted: bool, *modules: str) -> None:
+    """Start the server that workers are forked from, which imports what they need while this process does its part.
+
+    `modules` are imported for workers of a sweep; without them, what workers of a collector need.
+    """
     if not wanted or not sys.platform.startswith("linux"):
         return
     import multiprocessing
@@ -14,7 +17,8 @@ def start_workers_early(wanted: bool, module: str = "deepracer_exp.collectors.wo
 
     multiprocessing.set_start_method("forkserver", force=True)
     package = "deepracer_exp.collectors"
-    multiprocessing.set_forkserver_preload([f"{package}.fork_server", module, f"{package}.fork_ready"])
+    needed = modules or (f"{package}.worker",)
+    multiprocessing.set_forkserver_preload([f"{package}.fork_server", *needed, f"{package}.fork_ready"])
     # Workers share the cores among themselves already; a linear-algebra thread pool in each would only compete.
     before = os.environ.get("OMP_NUM_THREADS")
     os.environ["OMP_NUM_THREADS"] = "1"

@@ -1,4 +1,4 @@
-"""A sweep from its overrides to its winner."""
+"""A sweep from its overrides to its winner. Its workers start before this process imports PyTorch."""
 
 import collections
 import contextlib
@@ -7,11 +7,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import optuna
-import torch
 from optuna.storages import RDBStorage
 from optuna.study import Study
 from optuna.trial import FrozenTrial
@@ -26,7 +25,6 @@ from deepracer_exp.config.running import MLflowTracking
 from deepracer_exp.config.sweep import SweepConfig, SweepRequest
 from deepracer_exp.env.real_car import require_car
 from deepracer_exp.env.setup import build_setup
-from deepracer_exp.evaluation.evaluator import Evaluator, OnStep
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, TrialGroup
 from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.rewards.reward import RewardFunction
@@ -42,7 +40,6 @@ from .queue.launcher import LocalLauncher
 from .queue.ray_launcher import RayLauncher
 from .queue.storage import open_storage, patiently, resolve_database
 from .queue.study import open_study
-from .queue.trial_run import Interrupted
 from .queue.worker_config import Parent, WorkerConfig, plan_trial
 from .report.best import (
     FreshLaps,
@@ -58,7 +55,10 @@ from .search.objectives import cost, objective_values, without_lap
 from .search.pruners import build_pruner
 from .search.samplers import build_sampler
 from .search.space import SearchSpace
-from .trial import Trial
+from .trial import Interrupted, Trial
+
+if TYPE_CHECKING:
+    from deepracer_exp.evaluation.evaluator import OnStep
 
 _log = logging.getLogger("deepracer_exp")
 
@@ -222,6 +222,8 @@ def _conclude(
     from .report.page import write_study_page
 
     if complete_trials(study) and worker_config.config.rerank:
+        import torch
+
         torch.set_num_threads(1)
 
         def check(*_: object) -> None:
@@ -292,7 +294,10 @@ def fresh(protocol: EvaluationConfig, trials: int) -> EvaluationConfig:
 
 
 def rerank(
-    worker_config: WorkerConfig, study: optuna.Study, on_next: Callable[[FrozenTrial], None], on_step: OnStep
+    worker_config: WorkerConfig,
+    study: optuna.Study,
+    on_next: Callable[[FrozenTrial], None],
+    on_step: "OnStep",
 ) -> list[FreshLaps]:
     """Race the best checkpoints of the best trials on fresh laps; return their results, the best first.
 
@@ -363,7 +368,10 @@ def _resampled(group: TrialGroup, objective: str, rng: np.random.Generator) -> V
     return sums[:, rng.integers(len(column), size=(_RESAMPLES, len(column)))].sum(axis=2)
 
 
-def _driven(run_dir: Path, protocol: EvaluationConfig, on_step: OnStep) -> Evaluation:
+def _driven(run_dir: Path, protocol: EvaluationConfig, on_step: "OnStep") -> Evaluation:
+    # PyTorch takes seconds to import, and the workers start first.
+    from deepracer_exp.evaluation.evaluator import Evaluator
+
     run = StoredRun(run_dir).with_checkpoint()
     return Evaluator(run.experiment, protocol)(run.read_policy().networks.policy, on_step)
 

@@ -8,6 +8,10 @@ from typing import Any, Self
 from optuna.trial import FrozenTrial
 
 
+class Interrupted(Exception):  # noqa: N818 - reads as what it is at the raise site
+    """This process was asked to end; the trial, or the sweep, resumes another time."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class SeedRun:
     """The run of a trial with one of its seeds."""

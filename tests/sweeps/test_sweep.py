@@ -17,11 +17,10 @@ from deepracer_exp.runs.files import read_object
 from deepracer_exp.sweeps.queue.claims import Claim
 from deepracer_exp.sweeps.queue.driver import Driver
 from deepracer_exp.sweeps.queue.storage import open_storage
-from deepracer_exp.sweeps.queue.trial_run import Interrupted
 from deepracer_exp.sweeps.queue.worker_config import Parent
 from deepracer_exp.sweeps.search.space import SearchSpace
 from deepracer_exp.sweeps.sweep import _conclude, _parent, _without_rules, begin_study_run, interval_of
-from deepracer_exp.sweeps.trial import SeedRun, Trial
+from deepracer_exp.sweeps.trial import Interrupted, SeedRun, Trial
 from deepracer_exp.tracking.store import resolve_store
 from deepracer_exp.training.signals import Interruption
 

@@ -31,7 +31,7 @@ from deepracer_exp.runs.folder import is_held
 from deepracer_exp.runs.result import FAILED, FINISHED, INTERRUPTED, STOPPED_EARLY, Ending
 from deepracer_exp.sweeps.search.objectives import intermediate_value, objective_values
 from deepracer_exp.sweeps.search.pruners import FirstOf, PruneDecision, is_worse_across_seeds
-from deepracer_exp.sweeps.trial import SeedRun, Trial, runs_as_json
+from deepracer_exp.sweeps.trial import Interrupted, SeedRun, Trial, runs_as_json
 from deepracer_exp.tracking.metadata import PARENT, STUDY
 from deepracer_exp.tracking.metrics import trial_metrics
 from deepracer_exp.tracking.study_run import TRIAL, end_trial_run, open_trial_run
@@ -55,10 +55,6 @@ _STATES = {FAILED: "FAIL", STOPPED_EARLY: "PRUNED"}
 """Optuna's state of a trial whose last run has this status; other runs are complete."""
 _SHOWN = ("iteration", "env_steps", "completion", "entropy", "eval_completion", "eval_lap_time_s")
 """Columns of metrics.jsonl for the live view."""
-
-
-class Interrupted(Exception):  # noqa: N818 - reads as what it is at the raise site
-    """The worker was asked to end; the trial resumes another time."""
 
 
 class TrialRun(Callback):

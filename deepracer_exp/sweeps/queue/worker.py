@@ -14,14 +14,14 @@ from optuna.storages import RDBStorage
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.sweeps.search.pruners import build_pruner
 from deepracer_exp.sweeps.search.samplers import build_sampler
-from deepracer_exp.sweeps.trial import Trial
+from deepracer_exp.sweeps.trial import Interrupted, Trial
 from deepracer_exp.training.callback import TakenOver
 from deepracer_exp.training.signals import Interruption
 
 from .claims import Claim, TrialClaims, report_results
 from .lease import Lease
 from .storage import patiently, resolve_database
-from .trial_run import Interrupted, TrialRun
+from .trial_run import TrialRun
 from .worker_config import WorkerConfig
 
 Value = TypeVar("Value")
