@@ -42,9 +42,11 @@ class Algorithm:
 
     Attributes:
         replay: Past steps that it learns from again, kept in the run folder; None: it needs none.
+        threads: That an update of networks of features may use.
     """
 
     replay: Replay | None = None
+    threads: int = 1
 
     def __init__(
         self, networks: PolicyNetworks, config: AlgorithmConfig, schedule: Schedule, seed: int

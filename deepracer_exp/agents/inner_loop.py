@@ -6,8 +6,10 @@ one call. Pictures, shared trunks, networks and losses of the user's own and `al
 by autograd, see `PPO`.
 """
 
+import functools
 import math
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -16,7 +18,7 @@ from numba import njit
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 from torch import Tensor, nn
-from torchrl.modules import MLP
+from torchrl.modules import MLP, ProbabilisticActor
 
 from deepracer_exp.config.learning import PPOConfig
 
@@ -24,6 +26,7 @@ from .actor_critic import ActorCritic
 
 Floats = NDArray[np.float32]
 
+NO_ACTIVATION = -1
 _ACTIVATIONS: dict[type[nn.Module], int] = {nn.ReLU: 0, nn.Tanh: 1, nn.ELU: 2, nn.SiLU: 3}
 _LEAST_LOG_STD = math.log(1e-4)
 """Log below which the standard deviation of the library's `AddStateIndependentNormalScale` stays as it is."""
@@ -35,7 +38,7 @@ COLUMNS = ("policy loss", "value loss", "entropy", "clip fraction", "kl", "gradi
 and the norm is that before clipping."""
 
 # Sums may be reordered; NaN and infinity must stay what they are, since they end a run.
-_compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "arcp", "nsz"})
+compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "arcp", "nsz"})
 
 
 class InnerLoop:
@@ -47,9 +50,9 @@ class InnerLoop:
         The networks fit (`fits`); the optimizer is that of `networks.parameters()`, without weight decay.
         """
         self._networks, self._optimizer, self._config = networks, optimizer, config
-        layers, self._log_std = _policy_layers(networks)
+        layers, self._log_std = policy_layers(networks.policy_head)
         self._layers: tuple[nn.Module, nn.Module] = layers, networks.value_head.module
-        self._blas = ThreadpoolController()
+        self._second = ThreadPoolExecutor(1, "value network")
         self.gradients: dict[Tensor, Floats] = {
             parameter: np.zeros(parameter.shape, np.float32) for parameter in networks.parameters()
         }
@@ -58,10 +61,12 @@ class InnerLoop:
     @staticmethod
     def fits(networks: ActorCritic) -> bool:
         """Return whether the networks are perceptrons that share nothing, as `build_actor_critic` makes them."""
-        heads = (_policy_layers(networks)[0], networks.value_head.module)
+        heads = (policy_layers(networks.policy_head)[0], networks.value_head.module)
         return networks.trunk is None and all(map(is_plain, heads))
 
-    def run(self, columns: Sequence[Tensor], size: int, lr: float, entropy_coeff: float) -> Tensor:
+    def run(
+        self, columns: Sequence[Tensor], size: int, lr: float, entropy_coeff: float, threads: int = 1
+    ) -> Tensor:
         """Make the gradient steps of an epoch in place.
 
         Args:
@@ -70,6 +75,7 @@ class InnerLoop:
             size: Steps of a minibatch; N is a multiple of it.
             lr: Learning rate.
             entropy_coeff: Weight of the entropy bonus.
+            threads: More than one: the two networks are differentiated at the same time. The result is the same.
 
         Returns:
             [gradient steps, `COLUMNS`]. It ends before the first step whose loss or gradient is not finite.
@@ -80,27 +86,48 @@ class InnerLoop:
         if self._log_std is not None:
             log_std, by_log_std = self._log_std.detach().numpy(), self.gradients[self._log_std]
         moments, taken = self._moments()
-        with self._blas.limit(limits=1, user_api="blas"):
-            table, made = _epoch(
-                tuple(column.numpy() for column in columns), size, policy, value, log_std, by_log_std, moments,
-                (lr, entropy_coeff, config.critic_coeff, config.clip_epsilon, config.max_grad_norm or math.inf),
-                config.loss_type == "huber", taken, self._optimizer.defaults["eps"],
-            )  # fmt: skip
+        arrays = tuple(column.numpy() for column in columns)
+        numbers = (entropy_coeff, config.critic_coeff, config.clip_epsilon)
+        adam = (lr, config.max_grad_norm or math.inf, self._optimizer.defaults["eps"])
+        epoch = _epoch if threads == 1 else self._epoch_of_two
+        _limit_products()
+        table, made = epoch(
+            arrays, size, policy, value, log_std, by_log_std, moments, numbers, adam,
+            config.loss_type == "huber", taken,
+        )  # fmt: skip
         for parameter in self._networks.parameters():
             self._optimizer.state[parameter]["step"] += made
         return torch.from_numpy(table[:made])
 
+    def _epoch_of_two(  # type: ignore[no-untyped-def]
+        self, columns, size, policy, value, log_std, by_log_std, moments, numbers, adam, huber, taken
+    ) -> tuple[Floats, int]:
+        """Do what `_epoch` does, bit for bit, with the value network on a thread of its own.
+
+        The threads sleep while one waits for the other: waiting in a loop, as OpenMP does, takes away the core that
+        the other needs on a busy machine.
+        """
+        minibatches = len(columns[0]) // size
+        table = np.zeros((minibatches, len(COLUMNS)), np.float32)
+        for number in range(minibatches):
+            row, first = table[number], number * size
+            values = self._second.submit(_value_gradient, columns, first, size, value, numbers, huber, row)
+            _policy_gradient(columns, first, size, policy, log_std, by_log_std, numbers, row)
+            values.result()
+            if not _step(moments, adam, taken + number + 1, row):
+                return table, number
+        return table, minibatches
+
     def _arrays(self, layers: nn.Module, rows: int) -> tuple[Any, ...]:
         """Return weights, biases, their gradients, outputs, slopes and gradients by outputs, and the activation."""
-        linear = [layer for layer in layers.children() if isinstance(layer, nn.Linear)]
-        kinds = [_ACTIVATIONS[type(layer)] for layer in layers.children() if type(layer) in _ACTIVATIONS]
+        linear, activation = linear_layers(layers)
         return (
             tuple(layer.weight.detach().numpy() for layer in linear),
             tuple(layer.bias.detach().numpy() for layer in linear),
             tuple(self.gradients[layer.weight] for layer in linear),
             tuple(self.gradients[layer.bias] for layer in linear),
-            *(tuple(np.empty((rows, layer.out_features), np.float32) for layer in linear) for _ in range(3)),
-            kinds[0] if kinds else 0,
+            *(outputs_of(linear, rows) for _ in range(3)),
+            activation,
         )
 
     def _moments(self) -> tuple[tuple[Any, ...], int]:
@@ -117,6 +144,15 @@ class InnerLoop:
         return tuple(zip(*rows, strict=True)), int(adam["step"])
 
 
+@functools.cache
+def _limit_products() -> None:
+    """Let matrix products in this process have one thread from now on: more of them wait for one another.
+
+    Limits for each call alone cost a millisecond an epoch.
+    """
+    ThreadpoolController().limit(limits=1, user_api="blas")
+
+
 def is_plain(layers: nn.Module) -> bool:
     """Return whether layers are linear with biases, one kind of activation between them and none at the end."""
     if type(layers) is not MLP:  # a class of the user's own may compute anything
@@ -130,45 +166,80 @@ def is_plain(layers: nn.Module) -> bool:
     )
 
 
-def _policy_layers(networks: ActorCritic) -> tuple[nn.Module, nn.Parameter | None]:
-    """Return the policy's layers and, of a continuous policy, the logarithm of its standard deviation."""
-    policy = networks.policy_head[0].module
+def policy_layers(policy_head: ProbabilisticActor) -> tuple[nn.Module, nn.Parameter | None]:
+    """Return a policy's layers and, of a continuous policy, the logarithm of its standard deviation."""
+    policy = policy_head[0].module
     scale = (
         getattr(policy[-1], "state_independent_scale", None) if isinstance(policy, nn.Sequential) else None
     )
     return (policy, None) if scale is None else (policy[0], scale)
 
 
-@njit(cache=True, nogil=True)  # reordered, the test for finite numbers would find NaN finite
-def _epoch(columns, size, policy, value, log_std, by_log_std, moments, numbers, huber, taken, epsilon):  # type: ignore[no-untyped-def]
+def linear_layers(layers: nn.Module) -> tuple[list[nn.Linear], int]:
+    """Return the linear layers of a plain perceptron, and the number of its activation."""
+    linear = [layer for layer in layers.children() if isinstance(layer, nn.Linear)]
+    kinds = [_ACTIVATIONS[type(layer)] for layer in layers.children() if type(layer) in _ACTIVATIONS]
+    return linear, kinds[0] if kinds else NO_ACTIVATION
+
+
+def outputs_of(linear: Sequence[nn.Linear], rows: int) -> tuple[Floats, ...]:
+    """Return an array for each layer's outputs, [rows, units]."""
+    return tuple(np.empty((rows, layer.out_features), np.float32) for layer in linear)
+
+
+@njit(cache=True, nogil=True)
+def _epoch(columns, size, policy, value, log_std, by_log_std, moments, numbers, adam, huber, taken):  # type: ignore[no-untyped-def]
     """Make the gradient steps; return the table of `COLUMNS` and how many rows of it were made."""
-    observation, action, log_prob, advantage, target = columns
-    lr, entropy_coeff, critic_coeff, clip_epsilon, max_norm = numbers
-    minibatches = len(observation) // size
+    minibatches = len(columns[0]) // size
     table = np.zeros((minibatches, len(COLUMNS)), np.float32)
     for number in range(minibatches):
-        rows = slice(number * size, (number + 1) * size)
-        row = table[number]
-        outputs = _forward(observation[rows], policy)
-        _differentiate(
-            outputs, action[rows], log_prob[rows], advantage[rows], log_std, by_log_std, clip_epsilon,
-            entropy_coeff, policy[6][-1], row,
-        )  # fmt: skip
-        _backward(observation[rows], policy)
-        outputs = _forward(observation[rows], value)
-        row[1] = _value_loss(outputs, target[rows], huber, critic_coeff, value[6][-1])
-        _backward(observation[rows], value)
-        norm = _norm(moments[1])
-        row[5] = norm
-        if not np.isfinite(norm + row[0] + row[1] + row[2]):
+        row, first = table[number], number * size
+        _policy_gradient(columns, first, size, policy, log_std, by_log_std, numbers, row)
+        _value_gradient(columns, first, size, value, numbers, huber, row)
+        if not _step(moments, adam, taken + number + 1, row):
             return table, number
-        # As torch.nn.utils.clip_grads_with_norm_ does.
-        share = min(1.0, max_norm / (norm + 1e-6))
-        _adam(moments, np.float32(share), lr, taken + number + 1, epsilon)
     return table, minibatches
 
 
-@_compiled
+@njit(cache=True, nogil=True)
+def _policy_gradient(columns, first, size, policy, log_std, by_log_std, numbers, row):  # type: ignore[no-untyped-def]
+    """Fill the policy's gradients, and its part of the row of `COLUMNS`."""
+    observation, action, log_prob, advantage, _ = columns
+    entropy_coeff, _, clip_epsilon = numbers
+    rows = slice(first, first + size)
+    outputs = _forward(observation[rows], policy)
+    _differentiate(
+        outputs, action[rows], log_prob[rows], advantage[rows], log_std, by_log_std, clip_epsilon,
+        entropy_coeff, policy[6][-1], row,
+    )  # fmt: skip
+    _backward(observation[rows], policy)
+
+
+@njit(cache=True, nogil=True)
+def _value_gradient(columns, first, size, value, numbers, huber, row):  # type: ignore[no-untyped-def]
+    """Fill the value network's gradients, and its part of the row of `COLUMNS`."""
+    observation, target = columns[0], columns[4]
+    rows = slice(first, first + size)
+    outputs = _forward(observation[rows], value)
+    row[1] = _value_loss(outputs, target[rows], huber, numbers[1], value[6][-1])
+    _backward(observation[rows], value)
+
+
+@njit(cache=True, nogil=True)  # reordered, the test for finite numbers would find NaN finite
+def _step(moments, adam, number, row):  # type: ignore[no-untyped-def]
+    """Make gradient step `number`, counted from 1; return whether losses and gradients were finite and it was made."""
+    lr, max_norm, epsilon = adam
+    norm = _norm(moments[1])
+    row[5] = norm
+    if not np.isfinite(norm + row[0] + row[1] + row[2]):
+        return False
+    # As torch.nn.utils.clip_grads_with_norm_ does.
+    share = min(1.0, max_norm / (norm + 1e-6))
+    _adam(moments, np.float32(share), lr, number, epsilon)
+    return True
+
+
+@compiled
 def _norm(gradients):  # type: ignore[no-untyped-def]
     square = 0.0
     for number in range(len(gradients)):
@@ -177,7 +248,7 @@ def _norm(gradients):  # type: ignore[no-untyped-def]
     return math.sqrt(square)
 
 
-@_compiled
+@compiled
 def _forward(inputs, network):  # type: ignore[no-untyped-def]
     """Fill outputs and slopes of the layers, and return the last outputs."""
     weights, biases, _, _, outputs, slopes, _, activation = network
@@ -194,30 +265,37 @@ def _forward(inputs, network):  # type: ignore[no-untyped-def]
     return outputs[-1]
 
 
-@_compiled
+@compiled
 def _activate(values, bias, slopes, activation):  # type: ignore[no-untyped-def]
     """Add a bias, apply the activation and write its slope."""
-    one, zero = np.float32(1.0), np.float32(0.0)
     for row in range(values.shape[0]):
         for unit in range(values.shape[1]):
-            value = values[row, unit] + bias[unit]
-            if activation == 0:
-                slope = one if value > zero else zero
-                value = value * slope if value == value else value
-            elif activation == 1:
-                value = np.tanh(value)
-                slope = one - value * value
-            elif activation == 2:
-                slope = one if value > zero else np.exp(value)
-                value = value if value > zero else slope - one
-            else:
-                share = one / (one + np.exp(-value))
-                slope = share * (one + value * (one - share))
-                value = value * share
-            values[row, unit], slopes[row, unit] = value, slope
+            values[row, unit], slopes[row, unit] = activated(values[row, unit] + bias[unit], activation)
 
 
-@_compiled
+@compiled
+def activated(value, activation):  # type: ignore[no-untyped-def]
+    """Return a number after an activation, and the activation's slope there."""
+    one, zero = np.float32(1.0), np.float32(0.0)
+    if activation == NO_ACTIVATION:
+        slope = one
+    elif activation == 0:
+        slope = one if value > zero else zero
+        value = value * slope if value == value else value
+    elif activation == 1:
+        value = np.tanh(value)
+        slope = one - value * value
+    elif activation == 2:
+        slope = one if value > zero else np.exp(value)
+        value = value if value > zero else slope - one
+    else:
+        share = one / (one + np.exp(-value))
+        slope = share * (one + value * (one - share))
+        value = value * share
+    return value, slope
+
+
+@compiled
 def _backward(inputs, network):  # type: ignore[no-untyped-def]
     """Fill the gradients of weights and biases, given those by the last outputs."""
     weights, _, by_weights, by_biases, outputs, slopes, by_outputs, _ = network
@@ -239,7 +317,33 @@ def _backward(inputs, network):  # type: ignore[no-untyped-def]
                     before[row, unit] *= slope[row, unit]
 
 
-@_compiled
+@compiled
+def limited_log_std(log_std):  # type: ignore[no-untyped-def]
+    """Return the logarithms of the standard deviations, (2,), that a continuous policy draws with."""
+    return np.maximum(log_std, np.float32(_LEAST_LOG_STD))
+
+
+@compiled
+def log_density(action, loc, log_std):  # type: ignore[no-untyped-def]
+    """Return the logarithm of a normal distribution's density at an action, all (2,)."""
+    density = 0.0
+    for axis in range(len(loc)):
+        apart = (action[axis] - loc[axis]) * math.exp(-log_std[axis])
+        density -= 0.5 * apart * apart + log_std[axis] + _HALF_LOG_2PI
+    return density
+
+
+@compiled
+def log_sum(logits):  # type: ignore[no-untyped-def]
+    """Return the logarithm of the sum of exponentials, by which logits become logarithms of probabilities."""
+    largest = logits.max()
+    total = 0.0
+    for index in range(len(logits)):
+        total += math.exp(logits[index] - largest)
+    return largest + math.log(total)
+
+
+@compiled
 def _differentiate(  # type: ignore[no-untyped-def]
     outputs,
     action,
@@ -261,21 +365,14 @@ def _differentiate(  # type: ignore[no-untyped-def]
     loss = entropy = clipped = kl = 0.0
     if action.ndim == 2:
         by_log_std[:] = -entropy_coeff
-        scale = np.maximum(log_std, np.float32(_LEAST_LOG_STD))
+        scale = limited_log_std(log_std)
         for axis in range(size):
             entropy += scale[axis] + 0.5 + _HALF_LOG_2PI
     for step in range(count):
-        now = 0.0
         if action.ndim == 2:
-            for axis in range(size):
-                apart = (action[step, axis] - outputs[step, axis]) * math.exp(-scale[axis])
-                now -= 0.5 * apart * apart + scale[axis] + _HALF_LOG_2PI
+            now = log_density(action[step], outputs[step], scale)
         else:
-            largest = outputs[step].max()
-            total = 0.0
-            for index in range(size):
-                total += math.exp(outputs[step, index] - largest)
-            normal = largest + math.log(total)
+            normal = log_sum(outputs[step])
             now = outputs[step, action[step]] - normal
         log_ratio = now - log_prob[step]
         ratio = math.exp(log_ratio)
@@ -312,7 +409,7 @@ def _differentiate(  # type: ignore[no-untyped-def]
     row[0], row[2], row[3], row[4] = loss / count, entropy, clipped / count, kl / count
 
 
-@_compiled
+@compiled
 def _value_loss(values, target, huber, weight, by_values):  # type: ignore[no-untyped-def]
     """Differentiate the loss of the values by them, and return it."""
     count, total = len(target), 0.0
@@ -328,7 +425,7 @@ def _value_loss(values, target, huber, weight, by_values):  # type: ignore[no-un
     return total / count * weight
 
 
-@_compiled
+@compiled
 def _adam(moments, share, lr, step, epsilon):  # type: ignore[no-untyped-def]
     """Scale the gradients and step along them. Source: Kingma and Ba 2015, arXiv 1412.6980, algorithm 1."""
     length = np.float32(lr / (1.0 - _BETA1**step))

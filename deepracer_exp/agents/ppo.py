@@ -274,7 +274,8 @@ class PPO(Algorithm):
         """Do what `_gradient_step` does for each minibatch of an epoch, and return the same of each."""
         columns = [steps[key] for key in ("observation", "action", "action_log_prob")]
         columns += [steps[key].squeeze(-1) for key in ("advantage", "value_target")]
-        made = loop.run([column.index_select(0, order) for column in columns], size, lr, entropy_coeff)
+        columns = [column.index_select(0, order) for column in columns]
+        made = loop.run(columns, size, lr, entropy_coeff, self.threads)
         if len(made) * size < len(order):
             self._gradient_step(steps[order.split(size)[len(made)]])  # names what is not finite
         return made

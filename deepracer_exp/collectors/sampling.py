@@ -7,6 +7,8 @@ from torch import Tensor
 from torch.distributions import Categorical, Distribution, Independent
 from torchrl.modules import TanhNormal
 
+from deepracer_exp.agents.compiled_policy import CompiledPolicy
+
 NOISE = "noise"
 """Standard normal numbers of each car for its next action, float64: one for an index, two for steering and speed."""
 
@@ -15,25 +17,28 @@ class SamplingPolicy(TensorDictModuleBase):
     """A policy that draws each car's action from the car's own random numbers, the key `NOISE`.
 
     Sampling from a generator of the process would make a run depend on how its cars are spread over processes. It
-    reads and writes what the policy does, and shares its parameters.
+    reads what the policy does, shares its parameters, and writes `action` and `action_log_prob`.
     """
 
     def __init__(self, policy: TensorDictModuleBase) -> None:
         """Wrap an `ActorCritic.policy`."""
         super().__init__()
         self.policy = policy
-        self.in_keys, self.out_keys = [*policy.in_keys, NOISE], policy.out_keys
+        self.in_keys, self.out_keys = [*policy.in_keys, NOISE], ["action", "action_log_prob"]
+        self._compiled = CompiledPolicy.of(policy)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Add action, log-probability and the distribution's parameters."""
-        # Apart, since a trunk's output is left there, too.
-        acted = tensordict.select(*self.policy.in_keys)
-        distribution = self.policy.get_dist(acted)
-        action, log_prob = _drawn(distribution, tensordict.get(NOISE))
-        acted.set("action", action)
-        acted.set("action_log_prob", log_prob)
-        for key in self.out_keys:
-            tensordict.set(key, acted.get(key))
+        """Add action and log-probability."""
+        noise = tensordict.get(NOISE)
+        if self._compiled is not None:
+            drawn = self._compiled.sample(tensordict.get("observation").numpy(), noise.numpy())
+            action, log_prob = map(torch.from_numpy, drawn)
+        else:
+            # Apart, since a trunk's output is left there, too.
+            acted = tensordict.select(*self.policy.in_keys)
+            action, log_prob = _drawn(self.policy.get_dist(acted), noise)
+        tensordict.set("action", action)
+        tensordict.set("action_log_prob", log_prob)
         return tensordict
 
 

@@ -128,6 +128,7 @@ class Trainer:
             if isinstance(setup.actions, DiscreteActions)
             else None,
         )
+        self.agent.threads = share or cores()
         rivals = experiment.race.rivals
         self.rivals = (
             None

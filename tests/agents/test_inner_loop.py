@@ -78,6 +78,15 @@ def test_many_updates_end_where_those_of_autograd_do(actions):
     )
 
 
+@pytest.mark.parametrize("actions", [3, None])
+def test_two_threads_make_the_same_steps_bit_for_bit(actions):
+    (networks, alone), (same, shared) = make(actions=actions), make(actions=actions)
+    shared.threads = 2
+    train(networks, alone, 5)
+    train(same, shared, 5)
+    assert torch.equal(parameters(networks), parameters(same))
+
+
 def test_a_scale_at_its_lower_limit_stays_there():
     networks, ppo = make(actions=None)
     scale = networks.policy_head[0].module[-1].state_independent_scale
@@ -87,8 +96,10 @@ def test_a_scale_at_its_lower_limit_stays_there():
     assert scale.tolist() == [-12.0, -12.0]
 
 
-def test_a_step_that_is_not_finite_is_not_made_and_named():
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_step_that_is_not_finite_is_not_made_and_named(threads):
     networks, ppo = make()
+    ppo.threads = threads
     batch = drive(networks)
     steps, _ = ppo._prepare(batch)
     steps["advantage"][3] = math.inf
