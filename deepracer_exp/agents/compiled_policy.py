@@ -93,17 +93,33 @@ def _layer(inputs, weights, bias, activation, outputs):  # type: ignore[no-untyp
     """Write the outputs of a layer, [N, units], for weights [inputs, units].
 
     A row's sums have one order. A BLAS has another for another number of rows, so that a run would depend on how its
-    cars are spread over processes.
+    cars are spread over processes. Four rows at a time read each weight once, which takes half the time.
     """
-    for row in range(len(inputs)):
+    rows, units = outputs.shape
+    together = rows - rows % 4
+    for row in range(0, together, 4):
+        y0, y1, y2, y3 = outputs[row], outputs[row + 1], outputs[row + 2], outputs[row + 3]
+        for unit in range(units):
+            y0[unit] = y1[unit] = y2[unit] = y3[unit] = bias[unit]
+        for place in range(inputs.shape[1]):
+            x0, x1 = inputs[row, place], inputs[row + 1, place]
+            x2, x3 = inputs[row + 2, place], inputs[row + 3, place]
+            for unit in range(units):
+                weight = weights[place, unit]
+                y0[unit] += x0 * weight
+                y1[unit] += x1 * weight
+                y2[unit] += x2 * weight
+                y3[unit] += x3 * weight
+    for row in range(together, rows):
         output = outputs[row]
         output[:] = bias
         for place in range(inputs.shape[1]):
             value = inputs[row, place]
-            for unit in range(len(output)):
+            for unit in range(units):
                 output[unit] += value * weights[place, unit]
-        for unit in range(len(output)):
-            output[unit], _ = activated(output[unit], activation)
+    for row in range(rows):
+        for unit in range(units):
+            outputs[row, unit], _ = activated(outputs[row, unit], activation)
 
 
 @compiled

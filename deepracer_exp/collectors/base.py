@@ -19,7 +19,12 @@ class Collector(ABC):
     """An endless source of batches; a context manager that leaves no process behind.
 
     Each batch is a TensorDict of batch size [cars of all processes, T], keys as in `RaceEnv` plus the policy's.
+
+    Attributes:
+        ahead_s: Seconds for which the last batch had been driven when it was asked for, see `begin_next`.
     """
+
+    ahead_s = 0.0
 
     def __enter__(self) -> Self:
         return self
@@ -35,9 +40,11 @@ class Collector(ABC):
         """
         chunks: list[TensorDictBase] = []
         frames = episodes = 0
-        began = time.monotonic()
+        spent_s = 0.0
         while True:
+            began = time.monotonic()
             chunk = self.next_batch()
+            spent_s += time.monotonic() - began + self.ahead_s
             frames += chunk.numel()
             episodes += int(chunk["next", "done"].sum())
             wanted = algorithm.episodes_per_iteration
@@ -46,7 +53,7 @@ class Collector(ABC):
                 chunks.append(chunk.clone())
                 continue
             whole = torch.cat([*chunks, chunk], dim=1) if chunks else chunk
-            return whole, time.monotonic() - began
+            return whole, spent_s
 
     @abstractmethod
     def next_batch(self) -> TensorDictBase:
@@ -54,6 +61,12 @@ class Collector(ABC):
 
         Raises:
             RunFailed: a worker is lost.
+        """
+
+    def begin_next(self) -> None:  # noqa: B027 - a collector need not be able to
+        """Start to collect the next batch with the policy published last, while the caller does other things.
+
+        Until it is asked for, only `state_dict`, which is that before this batch, and `close` may be called.
         """
 
     @abstractmethod

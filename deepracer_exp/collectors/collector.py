@@ -7,13 +7,12 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.collectors import Collector as TorchRLCollector
 from torchrl.collectors import MultiSyncCollector
 from torchrl.weight_update import SharedMemWeightSyncScheme
 
@@ -28,9 +27,10 @@ from deepracer_exp.runs.files import HEARTBEAT
 from .base import Collector, by_worker, cars_per_process, states_of, worker_count
 from .sampling import SamplingPolicy
 from .watchdog import Watchdog
-from .worker import EnvFactory
+from .worker import CarCollector, EnvFactory
 
 _LOOK_EVERY_S = 0.2
+_LAST_BATCH_S = 1.0  # for which a batch that nobody will read is waited for, before its workers are killed
 _CHUNK_STEPS = 32  # control steps of each car between two counts of the episodes that have ended
 
 _T = TypeVar("_T")
@@ -59,6 +59,8 @@ class LocalCollector(Collector):
         self._run_dir = run_dir
         self._batches = 0
         self._begun_from = state or {}
+        self._next: Future[TensorDictBase] | None = None
+        self._states: list[Any] = []
         states = states_of(self._begun_from, max(1, self._workers))
         self._watchdog: Watchdog | None = None
         cars = cars_per_process(config)
@@ -72,7 +74,7 @@ class LocalCollector(Collector):
         }
         if self._workers == 0:
             env = factory(worker=0, threads=config.threads)
-            self._collector: Any = TorchRLCollector(
+            self._collector: Any = CarCollector(
                 env, policy, track_traj_ids=False, auto_register_policy_transforms=False, **options
             )
         else:
@@ -99,6 +101,13 @@ class LocalCollector(Collector):
             self._end_all()
         self.close()
 
+    def begin_next(self) -> None:
+        """Let the workers drive the next batch meanwhile; in this process nothing begins."""
+        if self._watchdog is not None:
+            self._states = self._worker_states()
+            self._begun_at_s = time.monotonic()
+            self._next = _in_background(self._receive)
+
     def publish_policy(self) -> None:
         """Pass the policy's weights to the workers."""
         if self._watchdog is None:
@@ -122,16 +131,15 @@ class LocalCollector(Collector):
             return dict(self._begun_from)
         if self._watchdog is None:
             return by_worker([self._collector.env.take_state()])
-        states = self._ask(
-            lambda: self._collector.map_fn("env.take_state"),
-            lambda: "a collector worker did not report the state of its cars",
-        )
-        return by_worker(states)
+        return by_worker(self._worker_states() if self._next is None else self._states)
 
     def close(self) -> None:
         """End every worker."""
         if self._watchdog is not None:
             self._watchdog.close()
+        if self._next is not None and wait([self._next], _LAST_BATCH_S).not_done:
+            self._end_all()
+            wait([self._next])
         if not self._collector.closed:
             threads = torch.get_num_threads()
             self._collector.shutdown()
@@ -144,7 +152,10 @@ class LocalCollector(Collector):
         others = len(multiprocessing.active_children())
         # The scheme that TorchRL would use itself; ours can be closed even if no collector is returned.
         self._weights = SharedMemWeightSyncScheme()
-        options = options | {"weight_sync_schemes": {"policy": self._weights}}
+        options = options | {
+            "weight_sync_schemes": {"policy": self._weights},
+            "collector_class": CarCollector,
+        }
         with contextlib.ExitStack() as undo:
             undo.callback(self._give_up_starting)
             try:
@@ -193,17 +204,16 @@ class LocalCollector(Collector):
 
         self._ask(put, lambda: "a collector worker did not restore its cars")
 
+    def _worker_states(self) -> list[Any]:
+        """Return the state of each worker's cars after its last batch."""
+        return self._ask(
+            lambda: self._collector.map_fn("env.take_state"),
+            lambda: "a collector worker did not report the state of its cars",
+        )
+
     def _ask(self, question: Callable[[], _T], silence: Callable[[], str]) -> _T:
         """Return the workers' answer; TorchRL alone would wait for it forever, even if the worker is dead."""
-        answer: Future[_T] = Future()
-
-        def ask() -> None:
-            try:
-                answer.set_result(question())
-            except BaseException as error:  # noqa: BLE001 - raised again by the thread that waits
-                answer.set_exception(error)
-
-        threading.Thread(target=ask, name="ask the workers", daemon=True).start()
+        answer = _in_background(question)
         for _ in range(round(self._hang_timeout_s / _LOOK_EVERY_S)):
             try:
                 return answer.result(_LOOK_EVERY_S)
@@ -229,9 +239,20 @@ class LocalCollector(Collector):
         self._batches += 1
         if self._watchdog is None:
             return next(self._source)
+        asked_s, begun, self._next = time.monotonic(), self._next, None
+        if begun is None:
+            self.ahead_s = 0.0
+            return self._receive()
+        batch = begun.result()
+        self.ahead_s = min(asked_s, self._driven_at_s) - self._begun_at_s
+        return batch
+
+    def _receive(self) -> TensorDictBase:
+        """Let the workers drive a batch and return it."""
+        assert self._watchdog is not None
         self._watchdog.expect()
         try:
-            batch = next(self._source)
+            batch: TensorDictBase = next(self._source)
         except (RuntimeError, ValueError, OSError, EOFError) as error:  # what TorchRL and a broken pipe raise
             loss = self._loss(patience_s=2.0)
             if loss is None:
@@ -240,6 +261,7 @@ class LocalCollector(Collector):
             raise loss from error
         finally:
             self._watchdog.rest()
+        self._driven_at_s = time.monotonic()
         return batch.flatten(0, 1)
 
     def _loss(self, patience_s: float = 0.0) -> RunFailed | None:
@@ -273,6 +295,20 @@ class LocalCollector(Collector):
             with contextlib.suppress(ValueError):  # a handle TorchRL has closed: that worker is gone
                 process.kill()
                 process.join()
+
+
+def _in_background(question: Callable[[], _T]) -> Future[_T]:
+    """Ask on a thread of its own, which does not keep the process from ending, and return what will be the answer."""
+    answer: Future[_T] = Future()
+
+    def ask() -> None:
+        try:
+            answer.set_result(question())
+        except BaseException as error:  # noqa: BLE001 - raised again by the thread that waits
+            answer.set_exception(error)
+
+    threading.Thread(target=ask, name="ask the workers", daemon=True).start()
+    return answer
 
 
 def _watch_deliveries(queue: Any, watchdog: Watchdog) -> None:

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.collectors import Collector as TorchRLCollector
 
 from deepracer_exp.config.running import CollectorConfig
 from deepracer_exp.env.head_to_head import Rivals, Weights
@@ -24,7 +23,7 @@ from deepracer_exp.runs.files import REWARD_PRINTS
 from . import ray_cluster
 from .base import Collector, by_worker, cars_per_process, states_of
 from .sampling import SamplingPolicy
-from .worker import EnvFactory
+from .worker import CarCollector, EnvFactory
 
 _LOOK_EVERY_S = 0.2
 _REPORT_EVERY_S = 0.5
@@ -94,7 +93,7 @@ class Cars:
                 reported_at = now
                 beats.report.remote(factory.worker, steps)
 
-        self._collector = TorchRLCollector(
+        self._collector = CarCollector(
             replace(factory, prints=self._kept, on_step=on_step)(),
             policy,
             frames_per_batch=frames_per_batch,

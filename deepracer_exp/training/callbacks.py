@@ -71,10 +71,14 @@ class EvalCallback(Callback):
         """
         self._every = experiment.checkpoints.every
         self._console = console
-        # The cars of the training wait meanwhile, so that all cores are free.
         sees = None if rival is None else rival.experiment.observation
+        # Cars in this process wait meanwhile; those of workers drive the next batch.
+        collector = experiment.collector
+        threads = collector.threads if collector.mode == "in_process" else 1
         self._evaluator = (
-            None if self._every is None else Evaluator(experiment, experiment.evaluation, rival_sees=sees)
+            None
+            if self._every is None
+            else Evaluator(experiment, experiment.evaluation, threads, rival_sees=sees)
         )
 
     def on_replay(self, trainer: Trainer) -> None:

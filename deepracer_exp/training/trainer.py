@@ -172,12 +172,14 @@ class Trainer:
                 if self.best.drove_best(finished, self.counters()):
                     self.checkpoints.save(self.agent, self.counters(), best=True)
 
-                # 2. Update the networks, and pass them to the cars.
+                # 2. Update the networks, pass them to the cars, and let these drive on during what follows.
                 began = time.monotonic()
                 update = self._update(batch)
                 collector.publish_policy()
                 update_s = time.monotonic() - began
                 self.iteration += 1
+                if self.rivals is None:
+                    collector.begin_next()
 
                 # 3. Measure: one row of metrics, the steps of the trace.
                 self.row = self._measure(finished, update, batch.numel(), collect_s, update_s)

@@ -1,5 +1,6 @@
 import os
 import signal
+from concurrent.futures import wait
 
 import numpy as np
 import pytest
@@ -74,6 +75,57 @@ def test_a_collection_continues_bit_for_bit_from_a_stored_state(driver_of, tmp_p
     assert_same(driver.collect(resumed, range(3, 5)), expected)
     if collector is SYNC:  # what a batch asks of a worker, and the watchdog expects
         assert np.fromfile(tmp_path / ".heartbeat", np.int64).tolist() == [40, 40]
+
+
+@pytest.mark.parametrize("collector", [IN_PROCESS, SYNC], ids=["in_process", "sync"])
+def test_a_batch_driven_ahead_is_the_same_and_so_is_the_state_before_it(driver_of, collector):
+    driver = driver_of(*collector)
+    expected = driver.collect(driver.open(), range(3))
+    ahead = driver.open()
+    batches = []
+    for turn in range(3):
+        if turn:
+            driver.learn(ahead, turn)
+        ahead.begin_next()
+        before = ahead.state_dict()
+        batches.append(ahead.next_batch().exclude("collector").clone())
+        if turn == 1:
+            state = before
+    assert_same(batches, expected)
+    again = driver.open(state)
+    driver.learn(again, 1)
+    assert_same([again.next_batch().exclude("collector")], expected[1:2])
+
+
+def test_the_seconds_of_a_batch_driven_ahead_count_as_collection(driver_of):
+    driver = driver_of(*SYNC)
+    collection = driver.open()
+    collection.next_batch()
+    assert collection.ahead_s == 0
+    collection.begin_next()
+    wait([collection._next])
+    collection.next_batch()
+    assert collection.ahead_s > 0
+
+
+def test_a_worker_lost_while_it_drives_ahead_is_named_when_a_batch_is_asked_for(driver_of, nothing_left):
+    with driver_of(*SYNC).open() as collection:
+        collection.next_batch()
+        collection.begin_next()
+        collection._collector.procs[1].kill()
+        with pytest.raises(RunFailed, match=r"collector worker 1 .* died by signal SIGKILL"):  # noqa: PT012
+            collection.next_batch()
+            collection.next_batch()  # the first may have been delivered before the kill
+
+
+def test_a_batch_that_nobody_reads_is_given_up_at_the_end(driver_of, nothing_left, monkeypatch):
+    monkeypatch.setattr("deepracer_exp.collectors.collector._LAST_BATCH_S", 0.1)
+    collection = driver_of(*SYNC).open()
+    collection.next_batch()
+    collection.begin_next()
+    for process in collection._collector.procs:
+        os.kill(process.pid, signal.SIGSTOP)
+    collection.close()
 
 
 def test_what_else_the_training_process_draws_does_not_change_what_its_cars_do(driver_of):
