@@ -12,6 +12,7 @@ from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.tracks.track import Track
 
 from .log_view import LogView
+from .once import once_per_view
 from .sectors import Sector, sectors_of
 from .statistics import Values
 
@@ -32,6 +33,7 @@ class Loss:
     """Seconds, a column for each of `CAUSES`, index: names of sectors."""
 
 
+@once_per_view
 def question_of(view: LogView, folder: Path) -> Question | None:
     """Return what the fastest lap of a run's car on the view's course depends on; None where that is not known.
 
@@ -50,6 +52,7 @@ def question_of(view: LogView, folder: Path) -> Question | None:
     return Question.of(experiment, track)
 
 
+@once_per_view
 def loss(view: LogView, folder: Path) -> Loss | None:
     """Compare the run's fastest exploring lap from the start line; None without one, or without a fastest lap."""
     try:

@@ -361,7 +361,8 @@ def _crashes(view: LogView) -> Finding | None:
 
 def _runs_off(view: LogView) -> list[Finding]:
     late, when = view.now()
-    steps = view.steps.loc[view.steps["episode"].isin(late["episode"]), list(off_track.COLUMNS)]
+    rows = view.rows_of(view.episodes.index.isin(late.index))
+    steps = view.steps[list(off_track.COLUMNS)].iloc[rows]
     thresholds = {"least": off_track.LEAST, "place_m": off_track.PLACE_M}
     places = off_track_places(steps)
     if not places:

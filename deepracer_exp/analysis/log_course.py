@@ -1,6 +1,7 @@
 """The courses of a recording, found by name or recognised by where the car drove."""
 
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -85,6 +86,12 @@ def find_courses(recording: Recording) -> tuple[dict[str, Track], tuple[LogProbl
     return tracks, tuple(problems)
 
 
+@cache
+def service_car() -> CarConfig:
+    """Return the car of the service's simulation: `car=deepracer`."""
+    return compose_option("car", "deepracer", CarConfig)
+
+
 def catalogue_track(name: str, reversed: bool = False) -> Track:
     """Return a world of the service, or the course of a route file (.npy) or a YAML of knots.
 
@@ -126,7 +133,7 @@ def _recognised(logged: str, sample: pd.DataFrame) -> _Recognised | None:
     away_m: dict[str, float] = {}
     for match in recognise(points, waypoint):
         away_m.setdefault(match.name, match.distance_m)
-    named, car = find_world(logged), compose_option("car", "deepracer", CarConfig)
+    named, car = find_world(logged), service_car()
     ranked: list[tuple[tuple[bool, float, bool, float], _Recognised]] = []
     for name in worlds():
         steps_m = np.linalg.norm(np.diff(world_rows(name)[:, :2], axis=0), axis=1)

@@ -212,7 +212,20 @@ class LogView:
 
     def of_episodes(self, wanted: NDArray[np.bool_], *columns: str) -> pd.DataFrame:
         """Return columns of the driven rows of the wanted episodes, (n,) in the order of `episodes`."""
-        return self._select(wanted[self.episode_index] & self.is_driven, columns)
+        rows = self.rows_of(wanted)
+        return self._taken(rows[self.is_driven[rows]], columns)
+
+    def rows_of(self, wanted: NDArray[np.bool_]) -> NDArray[np.intp]:
+        """Return the numbers of the rows in `steps` of the wanted episodes, (n,) in the order of `episodes`."""
+        begin = self._begins[:-1][wanted]
+        counts = self._begins[1:][wanted] - begin
+        ends = np.cumsum(counts)
+        return np.arange(counts.sum()) + np.repeat(begin - ends + counts, counts)
+
+    @cached_property
+    def _begins(self) -> NDArray[np.intp]:
+        """First row of each episode, and the number of all rows."""
+        return np.append(np.flatnonzero(np.diff(self.episode_index, prepend=-1)), len(self.steps))
 
     def fastest_lap(self, *columns: str) -> pd.DataFrame | None:
         """Return columns of the driven rows of the fastest complete lap, None without a lap."""
@@ -222,8 +235,10 @@ class LogView:
         return self.of_episodes(np.arange(len(times_s)) == np.nanargmin(times_s), *columns)
 
     def _select(self, wanted: NDArray[np.bool_], columns: Sequence[str]) -> pd.DataFrame:
+        return self._taken(np.flatnonzero(wanted), columns)
+
+    def _taken(self, rows: NDArray[np.intp], columns: Sequence[str]) -> pd.DataFrame:
         # Column by column: a frame of all columns would take seconds on millions of rows.
-        rows = np.flatnonzero(wanted)
         return pd.DataFrame({name: self.steps[name].to_numpy()[rows] for name in columns}, copy=False)
 
 

@@ -12,6 +12,7 @@ from deepracer_exp.tracks.track import Track
 
 from .log_course import waypoint_positions
 from .log_view import LEAST_LAPS, LogView
+from .once import once_per_view
 from .statistics import Values
 from .step_columns import first_rows, laps_driven
 
@@ -132,19 +133,21 @@ def interval_times(steps: pd.DataFrame, bounds: Values, wanted: Sequence[int] | 
     return pd.DataFrame(spent_s, index=laps)
 
 
-def times_by_sector(steps: pd.DataFrame, sectors: Sequence[Sector]) -> pd.DataFrame:
+def times_by_sector(
+    steps: pd.DataFrame, sectors: Sequence[Sector], wanted: Sequence[int] | None = None
+) -> pd.DataFrame:
     """Return `interval_times` of the sectors, columns by their names; of laps whose times are all known."""
     bounds = np.array([0.0, *(part.end for part in sectors)])
-    times = interval_times(steps, bounds).set_axis([part.name for part in sectors], axis=1)
+    times = interval_times(steps, bounds, wanted).set_axis([part.name for part in sectors], axis=1)
     return times[np.isfinite(times).all(axis=1)]
 
 
+@once_per_view
 def sectors_now(view: LogView, course: Track) -> tuple[list[Sector], pd.DataFrame, str]:
     """Return the sectors, `times_by_sector` of the laps that show how the car drives now, and which laps they are."""
     episodes, when = view.now(LEAST_LAPS)
     sectors = sectors_of(course)
-    times = times_by_sector(view.steps, sectors)
-    return sectors, times[times.index.isin(episodes.index)], when
+    return sectors, times_by_sector(view.steps, sectors, episodes.index), when
 
 
 def time_lost(steps: pd.DataFrame, lap: int, other: int) -> pd.DataFrame:

@@ -7,7 +7,7 @@ import pandas as pd
 
 from deepracer_exp.runs.result import RELIABLE
 
-from .statistics import Values
+from .statistics import Values, chance_of_rise
 
 LEAST_TIMES = 8
 """Lap times without which nothing is said."""
@@ -94,7 +94,7 @@ def _tested(name: str, iteration: np.ndarray, laps_s: Values, returns: Values) -
     if averages_s[-1] < (1 + SLOWER) * averages_s[fastest]:
         return None
     starts = len(averages_s) - _AVERAGED
-    if not _rises(times_s[fastest:], CHANCE / starts):
+    if not chance_of_rise(times_s[fastest:]) < CHANCE / starts:
         return None
     middle = parts[fastest + _AVERAGED // 2]
     return SlowerLaps(
@@ -104,13 +104,5 @@ def _tested(name: str, iteration: np.ndarray, laps_s: Values, returns: Values) -
         now_s=float(averages_s[-1]),
         return_then=float(np.mean(rewards[fastest : fastest + _AVERAGED])),
         return_now=float(np.mean(rewards[-_AVERAGED:])),
-        return_rose=_rises(rewards[fastest:], _RETURN_CHANCE),
+        return_rose=chance_of_rise(rewards[fastest:]) < _RETURN_CHANCE,
     )
-
-
-def _rises(values: Values, chance: float) -> bool:
-    """Return whether values rise with their order beyond a chance."""
-    from scipy.stats import kendalltau  # takes a second, and few trainings become slower
-
-    trend = kendalltau(np.arange(len(values)), values, alternative="greater", nan_policy="omit")
-    return bool(trend.pvalue < chance)

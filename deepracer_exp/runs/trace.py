@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from deepracer_exp.config.race import RaceConfig
@@ -271,6 +272,48 @@ def rewind_trace(folder: Path, iteration: int) -> None:
             file.unlink()
 
 
+def read_stored(path: Path, columns: Sequence[str]) -> pa.Table:
+    """Read columns of one file of a trace with the types in which it has them: decimals, or those of `SCHEMA`.
+
+    Raises:
+        OSError, pyarrow.ArrowException, KeyError, ValueError: it is incomplete or of another kind.
+    """
+    with pq.ParquetFile(path, pre_buffer=False) as file:
+        table = file.read(columns=list(columns), use_threads=False).select(list(columns))
+    # Runs of earlier versions have no decimals.
+    return table if table.schema.equals(_fields(_STORED, columns)) else table.cast(_fields(SCHEMA, columns))
+
+
+def join_stored(tables: Sequence[pa.Table]) -> pa.Table:
+    """Join tables of `read_stored` with the same columns, one after the other."""
+    if any(table.schema != tables[0].schema for table in tables):
+        tables = [table.cast(_fields(SCHEMA, table.column_names)) for table in tables]
+    return pa.concat_tables(tables).unify_dictionaries()
+
+
+def stored_values(
+    column: pa.ChunkedArray, rows: NDArray[np.intp] | None = None
+) -> "NDArray[Any] | pd.Categorical":
+    """Return rows (None: all) of a column of `read_stored`: numbers, NaN where one is missing, flags, or words."""
+    kind = column.type
+    if pa.types.is_dictionary(kind):
+        words = column.to_pandas().array
+        return words if rows is None else words.take(rows)
+    if not pa.types.is_decimal(kind):
+        values: NDArray[Any] = column.to_numpy()
+        return values if rows is None else values[rows]
+    # Arrow divides each number by itself, in fifty times as long.
+    digits = [
+        np.frombuffer(chunk.buffers()[1], np.dtype(f"i{kind.byte_width}"), len(chunk) + chunk.offset)[
+            chunk.offset :
+        ]
+        for chunk in column.chunks
+    ]
+    whole = np.concatenate([*digits, np.zeros(0, np.int32)])
+    number: NDArray[np.float64] = (whole if rows is None else whole[rows]) / 10.0**kind.scale
+    return number
+
+
 def read_trace(folder: Path, columns: Sequence[str] = TRACE_COLUMNS) -> "pd.DataFrame":
     """Read the trace of a run, in the order of iterations.
 
@@ -279,12 +322,21 @@ def read_trace(folder: Path, columns: Sequence[str] = TRACE_COLUMNS) -> "pd.Data
     Raises:
         BadInput: there is no trace, or a file is incomplete or of another kind.
     """
-    schema = pa.schema([SCHEMA.field(name) for name in columns])
+    import pandas as pd
+
     tables = []
     for path in trace_files(folder):
         try:
-            tables.append(pq.read_table(path, columns=list(columns)).cast(schema))
-        except (OSError, pa.ArrowInvalid, ValueError) as error:
+            tables.append(read_stored(path, columns))
+        except (OSError, pa.ArrowException, KeyError, ValueError) as error:
             reason = " ".join(str(error).split())
             raise BadInput(path, f"not a trace ({reason})", "a complete Parquet file of a run") from error
-    return pa.concat_tables(tables).to_pandas()
+    whole, read = join_stored(tables), {}
+    for name in columns:
+        values = stored_values(whole[name])
+        read[name] = values.astype(np.float32) if SCHEMA.field(name).type == pa.float32() else values
+    return pd.DataFrame(read, copy=False)
+
+
+def _fields(schema: pa.Schema, columns: Sequence[str]) -> pa.Schema:
+    return pa.schema([schema.field(name) for name in columns])

@@ -5,8 +5,18 @@ import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import kendalltau, trim_mean
 
-from deepracer_exp.analysis.statistics import histogram, means, moving_average, quantiles, totals, wilson
+from deepracer_exp.analysis.evidence import interquartile_mean
+from deepracer_exp.analysis.statistics import (
+    chance_of_rise,
+    histogram,
+    means,
+    moving_average,
+    quantiles,
+    totals,
+    wilson,
+)
 
 NUMBERS = st.lists(st.floats(-1e3, 1e3).map(lambda v: round(v, 3)), min_size=1, max_size=200)
 
@@ -47,3 +57,18 @@ def test_wilson_agrees_with_a_published_interval() -> None:
     low, high = wilson(np.array([81.0, 0.0]), np.array([263.0, 20.0]))
     np.testing.assert_allclose(low, [0.2553, 0.0], atol=5e-5)
     np.testing.assert_allclose(high, [0.3662, 0.1611], atol=5e-5)
+
+
+@given(st.lists(st.one_of(st.integers(0, 5).map(float), st.floats(0.0, 9.0), st.just(np.nan)), max_size=12))
+def test_the_chance_of_a_rise_is_that_of_kendalls_tau(values: list[float]) -> None:
+    expected = kendalltau(np.arange(len(values)), values, alternative="greater", nan_policy="omit").pvalue
+    assert chance_of_rise(np.array(values)) == pytest.approx(expected, rel=1e-12, nan_ok=True)
+
+
+@given(st.lists(NUMBERS.map(lambda numbers: (numbers * 7)[:7]), min_size=1, max_size=4), st.integers(1, 7))
+def test_an_interquartile_mean_leaves_a_quarter_out_at_either_end(
+    rows: list[list[float]], seeds: int
+) -> None:
+    scores = np.array(rows)[:, :seeds]
+    np.testing.assert_array_equal(interquartile_mean(scores), trim_mean(scores, 0.25, axis=1))
+    np.testing.assert_array_equal(interquartile_mean(scores.T, axis=0), trim_mean(scores, 0.25, axis=1))

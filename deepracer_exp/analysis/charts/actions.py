@@ -1,13 +1,13 @@
 """The actions that the car takes, and the places where it takes them."""
 
 from dataclasses import dataclass
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
 from deepracer_exp.analysis.log_view import LogView, closest_waypoints, thirds
+from deepracer_exp.analysis.once import once_per_view
 from deepracer_exp.analysis.sectors import sector_at, sectors_of
 from deepracer_exp.analysis.statistics import Values, means, totals
 
@@ -51,14 +51,10 @@ class ActionClasses:
     """Whether classes are ranges of a continuous action space."""
 
 
-_SORTED: WeakKeyDictionary[LogView, ActionClasses | None] = WeakKeyDictionary()
-
-
+@once_per_view
 def action_classes(view: LogView) -> ActionClasses | None:
-    """Sort the training's actions into classes, once for all figures; None if none is logged."""
-    if view not in _SORTED:
-        _SORTED[view] = classify(view.driven(*COLUMNS))
-    return _SORTED[view]
+    """Sort the training's actions into classes; None if none is logged."""
+    return classify(view.driven(*COLUMNS))
 
 
 def classify(rows: pd.DataFrame) -> ActionClasses | None:
@@ -68,10 +64,15 @@ def classify(rows: pd.DataFrame) -> ActionClasses | None:
     if not logged.any():
         return None
     action = rows["action"].to_numpy(np.float64)
-    listed = pd.unique(action[logged])
-    continuous = bool(not np.isfinite(listed).all() or len(listed) > MOST_CLASSES)
-    key = np.where(logged, _ranges(steer, speed) if continuous else action, np.nan)
-    code, listed = pd.factorize(key, sort=True)  # -1 where nothing is logged
+    numbered = np.isfinite(action[logged]).all()
+    listed = pd.unique(action[logged]) if numbered else action[:0]
+    continuous = not numbered or len(listed) > MOST_CLASSES
+    if continuous:
+        key = _ranges(steer, speed)
+        listed = np.flatnonzero(totals(np.where(logged, key, -1), None, int(key.max()) + 1))
+    else:
+        key, listed = action, np.sort(listed)
+    code = np.where(logged, np.searchsorted(listed, key), -1)
     groups = pd.DataFrame(
         {name: means(code, values, len(listed)) for name, values in (("steer", steer), ("speed", speed))},
         index=listed,
@@ -94,11 +95,11 @@ def classify(rows: pd.DataFrame) -> ActionClasses | None:
     )
 
 
-def _ranges(steer: Values, speed: Values) -> Values:
+def _ranges(steer: Values, speed: Values) -> NDArray[np.intp]:
     low, high = np.nanmin(speed), np.nanmax(speed)
     turn = np.digitize(steer / max(np.nanmax(np.abs(steer)), 1e-9), STEERING_EDGES)
     pace = np.digitize((speed - low) / max(high - low, 1e-9), SPEED_EDGES)
-    return (turn * len(SPEED_NAMES) + pace).astype(np.float64)
+    return turn * len(SPEED_NAMES) + pace
 
 
 def _angle(steering_deg: float) -> str:

@@ -11,7 +11,8 @@ from numpy.polynomial import Polynomial
 
 from deepracer_exp.analysis.log_view import LEAST_LAPS, LogView, thirds
 from deepracer_exp.analysis.sectors import Sector, sectors_of, time_lost
-from deepracer_exp.analysis.statistics import Values, histogram, means, subsample
+from deepracer_exp.analysis.statistics import Values, histogram, means, quantiles, subsample
+from deepracer_exp.analysis.step_columns import first_rows
 from deepracer_exp.errors import count
 
 from .figure import Chart, Layer, Panel, bars, colored_points, in_rows, line, mark, points
@@ -208,8 +209,8 @@ def ordinary_lap(episodes: pd.DataFrame, fastest: int) -> int:
 
 def _along(view: LogView, lap: int) -> pd.DataFrame:
     """Return the rows of a lap from the start line on, with a gap where the lap began and ended."""
-    rows = view.steps[view.steps["episode"] == view.episodes.loc[lap, "episode"]]
-    rows = rows[["lap_position", "track_speed_mps", "steer", "offset_m"]].reset_index(drop=True)
+    steps = view.steps[["lap_position", "track_speed_mps", "steer", "offset_m"]]
+    rows = steps.iloc[view.rows_of(view.episodes.index == lap)].reset_index(drop=True)
     for column in ("track_speed_mps", "steer"):
         rows[column] = rows[column].rolling(_SMOOTHED, center=True, min_periods=1).mean()
     first = int(rows["lap_position"].to_numpy().argmin())
@@ -269,9 +270,8 @@ def correlations(view: LogView) -> Chart | None:
 
 def _lap_columns(view: LogView) -> pd.DataFrame:
     """Return `lap_time_s` and `LAP_COLUMNS` of each complete lap."""
-    number = view.episode_index
-    rows = np.flatnonzero(view.episodes["lap_time_s"].notna().to_numpy()[number])
-    lap = number[rows]
+    rows = view.rows_of(view.episodes["lap_time_s"].notna().to_numpy())
+    lap = view.episode_index[rows]
     begin = np.flatnonzero(np.diff(lap, prepend=-1))
     count = np.diff(np.append(begin, len(lap)))
     end, place = begin + count - 1, np.repeat(np.arange(len(begin)), count)
@@ -292,7 +292,7 @@ def _lap_columns(view: LogView) -> pd.DataFrame:
             "reward_step": mean(part["reward"]),
             "reward_last": part["reward"][end],
             "steer_change_deg": mean(changed),
-            "slide_top_deg": pd.Series(np.abs(part["slide_deg"])).groupby(place).quantile(0.95),
+            "slide_top_deg": quantiles(place, np.abs(part["slide_deg"]), len(begin), (0.95,))[0],
             "offset_mean_m": mean(np.abs(part["offset_m"])),
             "start_speed_mps": started,
             "start": 100.0 * ((part["lap_position"][begin] - part["progress"][begin] / 100.0) % 1.0),
@@ -304,7 +304,7 @@ def _lap_columns(view: LogView) -> pd.DataFrame:
 
 def start_position(view: LogView) -> Chart | None:
     """Draw how far and how fast episodes drive from each start position."""
-    first = view.steps.drop_duplicates(["stream", "episode"])
+    first = view.steps[["lap_position", "progress"]].iloc[np.flatnonzero(first_rows(view.steps))]
     # Starts at one position differ by where the car settles, so that a part begins half of its width earlier.
     place = (first["lap_position"] - first["progress"] / 100.0).to_numpy(np.float64) * _STARTS
     episodes = view.episodes[["progress", "lap_time_s"]].assign(

@@ -1,11 +1,13 @@
 """Maps of a course: the road, cells over it, and numbers of waypoints beside it."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from deepracer_exp.analysis.statistics import Values, means
@@ -49,10 +51,9 @@ class Grid:
 
     def of(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.intp]:
         """Return the cell of each point (n,): row by row from the lower left; -1 where it is outside."""
-        column = np.floor((np.asarray(x, np.float64) - self.low_x) / self.side_m)
-        row = np.floor((np.asarray(y, np.float64) - self.low_y) / self.side_m)
-        inside = (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
-        return np.where(inside, row * self.columns + column, -1).astype(np.intp)
+        x, y = (np.ascontiguousarray(values, np.float64) for values in (x, y))
+        cells: NDArray[np.intp] = _cells(x, y, self.low_x, self.low_y, self.side_m, self.columns, self.rows)
+        return cells
 
     @property
     def count(self) -> int:
@@ -68,6 +69,16 @@ class Grid:
         x = self.low_x + self.side_m * (np.arange(self.columns) + 0.5)
         y = self.low_y + self.side_m * (np.arange(self.rows) + 0.5)
         return heatmap(x, y, values.reshape(self.rows, self.columns), scale, **more)
+
+
+@njit(cache=True, nogil=True)
+def _cells(x, y, low_x, low_y, side_m, columns, rows):  # type: ignore[no-untyped-def]
+    cells = np.full(len(x), -1, np.intp)
+    for i in range(len(x)):
+        column, row = math.floor((x[i] - low_x) / side_m), math.floor((y[i] - low_y) / side_m)
+        if 0 <= column < columns and 0 <= row < rows:
+            cells[i] = int(row) * columns + int(column)
+    return cells
 
 
 def map_panel(course: Track, layers: Sequence[Layer], title: str = "", numbers: bool = True) -> Panel:

@@ -12,6 +12,7 @@ import pandas as pd
 from deepracer_exp.analysis.evidence import iqm_band
 from deepracer_exp.analysis.log_view import LogView
 from deepracer_exp.analysis.statistics import Values, moving_average
+from deepracer_exp.aws.logs.recording import TRAINING
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.files import EVALUATIONS, METRICS
 from deepracer_exp.runs.lineage import read_lineage
@@ -211,7 +212,7 @@ def policy_of(view: LogView) -> tuple[str, str | None, dict[str, float]]:
     Of a run of ours those are the stored evaluations.
     """
     steps = view.recording.steps
-    raced = steps[steps["stream"].astype(str) != "training"].astype({"track": str, "stream": str})
+    raced = steps[(steps["stream"] != TRAINING).to_numpy()].astype({"track": str, "stream": str})
     episodes = raced.groupby(["track", "stream", "episode"])["progress"].max()
     by_track: dict[str, float] = episodes.groupby("track").mean().to_dict()
     folder = run_folder(view)
