@@ -42,6 +42,8 @@ STILL_M = 0.01
 """Movement below which a car has no direction of travel."""
 STOPPED = ("off_track", "crashed", "immobilized", "reversed")
 """Status of the rows after which a car is put back, or the episode ends."""
+_TOGETHER = 2**16
+"""Rows that are projected together."""
 FIRST_STEPS = 2
 """Highest step number of an episode's first row: formats without prepare rows may begin with 2."""
 
@@ -166,8 +168,15 @@ def _places(
 ) -> tuple[Values, Values, Values]:
     """Return lap position, offset and the centre line's direction in degrees."""
     if course is not None:
-        projected = course.project(steps[["X", "Y"]].to_numpy(np.float64))
-        return projected.ndist, projected.offset_m, np.degrees(projected.heading_rad)
+        x, y = (steps[name].to_numpy(np.float64) for name in ("X", "Y"))
+        lap_position, offset_m, center_deg = np.empty((3, len(steps)))
+        # In parts: memory that is touched for the first time costs more than the projection.
+        for begin in range(0, len(steps), _TOGETHER):
+            part = slice(begin, begin + _TOGETHER)
+            projected = course.project(np.column_stack([x[part], y[part]]))
+            lap_position[part], offset_m[part] = projected.ndist, projected.offset_m
+            center_deg[part] = np.degrees(projected.heading_rad)
+        return lap_position, offset_m, center_deg
     unknown = np.full(len(steps), np.nan)
     if not len(steps):
         return unknown, unknown, unknown

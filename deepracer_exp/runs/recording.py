@@ -1,5 +1,6 @@
 """The recording of a run of ours: in the schema that all logs share, and what only a run has."""
 
+import contextlib
 import json
 import math
 from collections.abc import Mapping
@@ -9,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import TypeAdapter, ValidationError
 
@@ -36,11 +36,13 @@ from deepracer_exp.errors import BadInput
 from .files import CONFIG, METRICS, REWARD, SUMMARY, TRACE, is_run, read_config, read_object
 from .result import IN_TRAINING, RunResult, read_result
 from .trace import (
+    UNREADABLE,
     join_stored,
     missing_trace,
+    open_trace_file,
     read_evaluation_others,
     read_others,
-    read_stored,
+    stored_column,
     stored_values,
     trace_files,
 )
@@ -78,7 +80,9 @@ LAPS_ONLY = (
     "trace=laps: has complete laps only; figures of places, actions and rewards leave out all other episodes"
 )
 
-_READ = [name for name in STEP_COLUMNS if name in SCHEMA.names]
+_UNUSED = {"worker": 0, "pause_duration": 0.0, "obstacle_crash_counter": 0.0}
+"""Columns that have one value in all our trainings: there are no penalties, and a crash ends an episode."""
+_READ = [name for name in STEP_COLUMNS if name in SCHEMA.names and name not in _UNUSED]
 _RACE: TypeAdapter[RaceConfig] = TypeAdapter(RaceConfig)
 _ACTION_SPACE: TypeAdapter[ActionSpaceConfig] = TypeAdapter(ActionSpaceConfig)
 
@@ -174,52 +178,77 @@ def read_run_recording(folder: Path) -> RunRecording:
 
 def _steps(folder: Path, problems: list[LogProblem], files: list[Path]) -> pd.DataFrame:
     """Read the newest iterations that together have no more than `MOST_STEPS` rows, by episode and step."""
-    traces = trace_files(folder / TRACE)
-    tables: dict[Path, pa.Table] = {}
+    opened: dict[Path, tuple[pq.ParquetFile, int]] = {}
     room, left_out = sim_trace.MOST_STEPS, 0
-    for path in reversed(traces):
-        try:
-            count = skipped = pq.read_metadata(path).num_rows
-            if room:
-                table = read_stored(path, _READ)
-                skipped = _too_old(table, room)
-                if skipped < count:
-                    tables[path] = table.slice(skipped)
-        except (OSError, pa.ArrowException, KeyError, ValueError) as error:
-            problems.append(LogProblem(str(path), None, f"left out: {_one_line(error)}"))
-            continue
-        left_out += skipped
-        room = 0 if skipped else room - count
-    if left_out:
-        reason = sim_trace.left_out_reason(left_out)
-        problems.append(LogProblem(str(folder / TRACE), None, reason, lines=left_out))
-    if not tables:
+    with contextlib.ExitStack() as stack:
+        for path in reversed(trace_files(folder / TRACE)):
+            try:
+                file = stack.enter_context(open_trace_file(path))
+                count = skipped = file.metadata.num_rows
+                if room:
+                    skipped = _too_old(file, room)
+                    if skipped < count:
+                        opened[path] = file, skipped
+            except UNREADABLE as error:
+                problems.append(LogProblem(str(path), None, f"left out: {_one_line(error)}"))
+                continue
+            left_out += skipped
+            room = 0 if skipped else room - count
+        if left_out:
+            reason = sim_trace.left_out_reason(left_out)
+            problems.append(LogProblem(str(folder / TRACE), None, reason, lines=left_out))
+        columns = None
+        while opened and columns is None:
+            columns = _columns(dict(sorted(opened.items())), opened, problems)
+    if columns is None:
         raise BadInput(f"{problems[0]}; nothing of the trace can be read")
-    files += sorted(tables)
-    whole = join_stored([tables.pop(path) for path in sorted(tables)])
-    episode = stored_values(whole["episode"])
-    # Sorted while they are unpacked: to sort all columns later takes as long as to read them.
-    by_episode = None if (np.diff(episode) >= 0).all() else np.argsort(episode, kind="stable")
-    columns: dict[str, Any] = {}
-    for name, (kind, _) in STEP_COLUMNS.items():
-        if name == "stream":
-            columns[name] = pd.Categorical.from_codes(np.zeros(len(whole), np.int8), [TRAINING])
-        elif name not in _READ:  # of the service's logs alone
-            columns[name] = np.full(len(whole), 0 if name == "worker" else np.nan, kind)
-        else:
-            values = stored_values(whole[name], by_episode)
-            columns[name] = values if kind == "category" else values.astype(kind, copy=False)
-    words = columns["episode_status"]
-    others = [word for word in words.categories if word not in EPISODE_STATUS]
-    columns["episode_status"] = words.set_categories([*EPISODE_STATUS, *others])
+    files += sorted(opened)
     return pd.DataFrame(columns, copy=False)
 
 
-def _too_old(table: pa.Table, room: int) -> int:
+def _columns(
+    opened: Mapping[Path, tuple[pq.ParquetFile, int]],
+    left: dict[Path, tuple[pq.ParquetFile, int]],
+    problems: list[LogProblem],
+) -> dict[str, Any] | None:
+    """Return the columns of opened files from a row of each on; None: one cannot be read, and is left no more.
+
+    A column is read from all files before the next: the memory that it was unpacked in is used again.
+    """
+    columns: dict[str, Any] = {}
+    by_episode = None
+    for name in ("episode", *(name for name in _READ if name != "episode")):
+        parts = []
+        for path, (file, skipped) in opened.items():
+            try:
+                parts.append(stored_column(file, name).slice(skipped))
+            except UNREADABLE as error:
+                problems.append(LogProblem(str(path), None, f"left out: {_one_line(error)}"))
+                del left[path]
+                return None
+        column = join_stored(name, parts)
+        if name == "episode":
+            episode = stored_values(column)
+            # Sorted while they are unpacked: to sort all columns later takes as long as to read them.
+            by_episode = None if (np.diff(episode) >= 0).all() else np.argsort(episode, kind="stable")
+        kind, values = STEP_COLUMNS[name][0], stored_values(column, by_episode)
+        columns[name] = values if kind == "category" else values.astype(kind, copy=False)
+    rows = len(columns["episode"])
+    columns["stream"] = pd.Categorical.from_codes(np.zeros(rows, np.int8), [TRAINING])
+    words = columns["episode_status"]
+    others = [word for word in words.categories if word not in EPISODE_STATUS]
+    columns["episode_status"] = words.set_categories([*EPISODE_STATUS, *others])
+    for name, (kind, _) in STEP_COLUMNS.items():
+        if name not in columns:  # of the service's logs alone: one number in memory for all rows
+            columns[name] = np.broadcast_to(np.full(1, _UNUSED.get(name, np.nan), kind), rows)
+    return {name: columns[name] for name in STEP_COLUMNS}
+
+
+def _too_old(file: pq.ParquetFile, room: int) -> int:
     """Return how many of the first rows go, so that `room` rows of whole iterations at most are left."""
-    if len(table) <= room:
+    if file.metadata.num_rows <= room:
         return 0
-    iterations = table["iteration"].to_numpy()
+    iterations = stored_values(stored_column(file, "iteration"))
     return int(np.searchsorted(iterations, iterations[-room - 1], side="right"))
 
 

@@ -272,46 +272,45 @@ def rewind_trace(folder: Path, iteration: int) -> None:
             file.unlink()
 
 
-def read_stored(path: Path, columns: Sequence[str]) -> pa.Table:
-    """Read columns of one file of a trace with the types in which it has them: decimals, or those of `SCHEMA`.
+UNREADABLE = (OSError, pa.ArrowException, KeyError, ValueError)
+"""Errors of a file that is incomplete or of another kind."""
 
-    Raises:
-        OSError, pyarrow.ArrowException, KeyError, ValueError: it is incomplete or of another kind.
-    """
-    with pq.ParquetFile(path, pre_buffer=False) as file:
-        table = file.read(columns=list(columns), use_threads=False).select(list(columns))
+
+def open_trace_file(path: Path) -> pq.ParquetFile:
+    """Open one file of a trace for `stored_column`; raises `UNREADABLE`."""
+    return pq.ParquetFile(path, pre_buffer=False)
+
+
+def stored_column(file: pq.ParquetFile, name: str) -> pa.ChunkedArray:
+    """Read a column of a file with its stored type, a decimal, or that of `SCHEMA`; raises `UNREADABLE`."""
+    column = file.read(columns=[name], use_threads=False)[name]
     # Runs of earlier versions have no decimals.
-    return table if table.schema.equals(_fields(_STORED, columns)) else table.cast(_fields(SCHEMA, columns))
+    return column if column.type == _STORED.field(name).type else column.cast(SCHEMA.field(name).type)
 
 
-def join_stored(tables: Sequence[pa.Table]) -> pa.Table:
-    """Join tables of `read_stored` with the same columns, one after the other."""
-    if any(table.schema != tables[0].schema for table in tables):
-        tables = [table.cast(_fields(SCHEMA, table.column_names)) for table in tables]
-    return pa.concat_tables(tables).unify_dictionaries()
+def join_stored(name: str, parts: Sequence[pa.ChunkedArray]) -> pa.ChunkedArray:
+    """Join the parts of a column, one after the other."""
+    if any(part.type != parts[0].type for part in parts):
+        parts = [part.cast(SCHEMA.field(name).type) for part in parts]
+    return pa.chunked_array([chunk for part in parts for chunk in part.chunks], parts[0].type)
 
 
 def stored_values(
     column: pa.ChunkedArray, rows: NDArray[np.intp] | None = None
 ) -> "NDArray[Any] | pd.Categorical":
-    """Return rows (None: all) of a column of `read_stored`: numbers, NaN where one is missing, flags, or words."""
+    """Return rows (None: all) of a stored column: numbers, NaN where one is missing, flags, or words."""
     kind = column.type
     if pa.types.is_dictionary(kind):
-        words = column.to_pandas().array
+        words = column.unify_dictionaries().to_pandas().array
         return words if rows is None else words.take(rows)
-    if not pa.types.is_decimal(kind):
-        values: NDArray[Any] = column.to_numpy()
-        return values if rows is None else values[rows]
-    # Arrow divides each number by itself, in fifty times as long.
-    digits = [
-        np.frombuffer(chunk.buffers()[1], np.dtype(f"i{kind.byte_width}"), len(chunk) + chunk.offset)[
-            chunk.offset :
-        ]
-        for chunk in column.chunks
-    ]
-    whole = np.concatenate([*digits, np.zeros(0, np.int32)])
-    number: NDArray[np.float64] = (whole if rows is None else whole[rows]) / 10.0**kind.scale
-    return number
+    if pa.types.is_decimal(kind):
+        # Arrow divides each number by itself, which takes fifty times as long.
+        whole = column.combine_chunks()
+        digits = np.frombuffer(whole.buffers()[1], np.dtype(f"i{kind.byte_width}"))
+        values: NDArray[Any] = digits[whole.offset : whole.offset + len(whole)] / 10.0**kind.scale
+    else:
+        values = column.to_numpy()
+    return values if rows is None else values[rows]
 
 
 def read_trace(folder: Path, columns: Sequence[str] = TRACE_COLUMNS) -> "pd.DataFrame":
@@ -324,19 +323,24 @@ def read_trace(folder: Path, columns: Sequence[str] = TRACE_COLUMNS) -> "pd.Data
     """
     import pandas as pd
 
-    tables = []
-    for path in trace_files(folder):
+    read: dict[str, Any] = {}
+    paths = trace_files(folder)
+    path = paths[0]
+    with contextlib.ExitStack() as stack:
         try:
-            tables.append(read_stored(path, columns))
-        except (OSError, pa.ArrowException, KeyError, ValueError) as error:
+            files = {}
+            for path in paths:
+                files[path] = stack.enter_context(open_trace_file(path))
+            # Column by column, so that the memory in which one was unpacked is used again for the next.
+            for name in columns:
+                parts = []
+                for path in paths:
+                    parts.append(stored_column(files[path], name))
+                read[name] = stored_values(join_stored(name, parts))
+        except UNREADABLE as error:
             reason = " ".join(str(error).split())
             raise BadInput(path, f"not a trace ({reason})", "a complete Parquet file of a run") from error
-    whole, read = join_stored(tables), {}
-    for name in columns:
-        values = stored_values(whole[name])
-        read[name] = values.astype(np.float32) if SCHEMA.field(name).type == pa.float32() else values
+    for name, values in read.items():
+        if SCHEMA.field(name).type == pa.float32():
+            read[name] = values.astype(np.float32, copy=False)
     return pd.DataFrame(read, copy=False)
-
-
-def _fields(schema: pa.Schema, columns: Sequence[str]) -> pa.Schema:
-    return pa.schema([schema.field(name) for name in columns])

@@ -3,7 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.stats import kendalltau, trim_mean
 
@@ -61,6 +61,7 @@ def test_wilson_agrees_with_a_published_interval() -> None:
 
 @given(st.lists(st.one_of(st.integers(0, 5).map(float), st.floats(0.0, 9.0), st.just(np.nan)), max_size=12))
 def test_the_chance_of_a_rise_is_that_of_kendalls_tau(values: list[float]) -> None:
+    assume(np.isfinite(values).sum() > 1)  # SciPy warns of fewer
     expected = kendalltau(np.arange(len(values)), values, alternative="greater", nan_policy="omit").pvalue
     assert chance_of_rise(np.array(values)) == pytest.approx(expected, rel=1e-12, nan_ok=True)
 

@@ -16,6 +16,7 @@ from deepracer_exp.aws.logs.recording import (
 )
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.action_space import build_action_space, metadata_of
+from deepracer_exp.env.trace import SCHEMA
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.recording import EVALUATION_COLUMNS, is_traced_run, read_run_recording
 from deepracer_exp.runs.trace import read_trace
@@ -46,11 +47,11 @@ def test_the_steps_are_the_rows_of_the_trace(trained):
     steps = read_run_recording(trained().folder).recording.steps
     assert steps.groupby("episode")["iteration"].nunique().max() > 1
     assert kinds(steps) == {name: kind for name, (kind, _) in STEP_COLUMNS.items()}
-    trace = read_trace(trained().folder / "trace")
+    trace = read_trace(trained().folder / "trace").sort_values("episode", kind="stable")
     assert len(steps) == len(trace) == 4096
     for name in STEP_COLUMNS:
         if name not in OWN:
-            np.testing.assert_array_equal(steps[name], trace[name], err_msg=name)
+            np.testing.assert_array_equal(steps[name].astype(trace[name].dtype), trace[name], err_msg=name)
     assert set(steps["stream"]) == {"training"}
     assert set(steps["worker"]) == {0}
     assert steps["wall_clock"].isna().all()
@@ -111,6 +112,17 @@ def test_a_file_of_the_trace_that_cannot_be_read_is_left_out_and_reported(folder
     assert problem.file == str(file)
     assert problem.reason.startswith("left out: ")
     assert file not in recording.files
+
+
+def test_files_of_earlier_versions_which_have_no_decimals_are_read_beside_others(folder):
+    steps = read_run_recording(folder).recording.steps
+    file = folder / "trace" / "00002-iteration.parquet"
+    pq.write_table(pq.read_table(file).cast(SCHEMA), file)
+    mixed = read_run_recording(folder).recording
+    assert not mixed.problems
+    for name in ("X", "progress", "tstamp", "reward"):
+        np.testing.assert_allclose(mixed.steps[name], steps[name], rtol=1e-12, err_msg=name)
+    pd.testing.assert_series_equal(mixed.steps["episode_status"], steps["episode_status"])
 
 
 def test_a_line_of_the_metrics_cut_off_by_a_kill_is_reported(folder):
