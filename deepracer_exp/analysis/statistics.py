@@ -113,8 +113,8 @@ def quantiles(place: ArrayLike, values: ArrayLike, n: int, shares: tuple[float, 
 
     Between two values they are interpolated linearly; -1 is no place.
     """
-    found: Values = _quantiles(_flat(place, np.int64), _flat(values, np.float64), n, np.array(shares))
-    return found
+    result: Values = _quantiles(_flat(place, np.int64), _flat(values, np.float64), n, np.array(shares))
+    return result
 
 
 @njit(cache=True, nogil=True)
@@ -129,16 +129,16 @@ def _quantiles(place, values, n, shares):  # type: ignore[no-untyped-def]
         if place[i] >= 0 and not math.isnan(values[i]):
             grouped[free[place[i]]] = values[i]
             free[place[i]] += 1
-    found = np.full((len(shares), n), np.nan)
+    result = np.full((len(shares), n), np.nan)
     for k in range(n):
         here = np.sort(grouped[end[k] : end[k + 1]])
         for number in range(len(shares) if len(here) else 0):
             rank = shares[number] * (len(here) - 1)
             low = int(rank)
-            found[number, k] = here[low]
+            result[number, k] = here[low]
             if low + 1 < len(here):
-                found[number, k] += (here[low + 1] - here[low]) * (rank - low)
-    return found
+                result[number, k] += (here[low + 1] - here[low]) * (rank - low)
+    return result
 
 
 def wilson(hits: ArrayLike, tries: ArrayLike) -> tuple[Values, Values]:
@@ -162,10 +162,13 @@ def chance_of_rise(values: Values) -> float:
     that of a normal distribution where some are equal (M. G. Kendall, Rank Correlation Methods, 1970). SciPy has this
     test, too, but takes a second to import.
     """
-    known = values[~np.isnan(values)]
-    n, equal = len(known), np.unique(known, return_counts=True)[1]
+    measured = values[~np.isnan(values)]
+    n, equal = len(measured), np.unique(measured, return_counts=True)[1]
     later, earlier = np.tril_indices(n, -1)
-    rising, falling = int((known[later] > known[earlier]).sum()), int((known[later] < known[earlier]).sum())
+    rising, falling = (
+        int((measured[later] > measured[earlier]).sum()),
+        int((measured[later] < measured[earlier]).sum()),
+    )
     if len(equal) < 2:
         return float("nan")
     if len(equal) < n:
