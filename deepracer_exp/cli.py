@@ -39,6 +39,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         arguments: of the command line, to run in this process; None: those of this process, and a command that runs
             reward functions does so in a child process.
     """
+    # Read when the library of torch's threads is loaded. By default a thread that has nothing to do keeps its core busy
+    # for milliseconds: beside other work an update from pictures takes twice as long, or twenty times.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     args = argparse.Namespace()
     words = without_passwords(list(sys.argv[1:] if arguments is None else arguments))
     if arguments is None:

@@ -1,4 +1,5 @@
 import json
+import os
 import shlex
 import subprocess
 import sys
@@ -26,6 +27,23 @@ HEAVY = (
 
 
 LIGHT = ["--help", "train --help", "import --help", "tracks --help", "ui --help", "--version"]
+
+
+@pytest.mark.parametrize(("given", "set_to"), [(None, "passive"), ("active", "active")])
+def test_threads_of_torch_leave_their_cores_while_they_wait_unless_told_otherwise(given, set_to):
+    code = """
+import contextlib, os
+from deepracer_exp.cli import main
+with contextlib.suppress(SystemExit):
+    main(["--version"])
+print(os.environ["OMP_WAIT_POLICY"])
+"""
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    environment |= {} if given is None else {"OMP_WAIT_POLICY": given}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, check=True, stdout=subprocess.PIPE, text=True
+    )
+    assert done.stdout.split()[-1] == set_to
 
 
 def test_help_imports_nothing_that_takes_time():

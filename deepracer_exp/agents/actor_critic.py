@@ -206,7 +206,8 @@ class SensorNet(nn.Module):
 
     Called with what there is of pictures, uint8 [..., channels, height, width], and readings, float32 [..., readings];
     returns float32 [..., outputs]. With pictures, products are in bfloat16 on a GPU, and on processors with
-    instructions for it (updates are 1.7 to 2.4 times as fast with AVX-512 BF16, three times with AMX).
+    instructions for it (updates are 1.7 to 2.4 times as fast with AVX-512 BF16, three times with AMX); pictures are
+    convolved as `convolve` says.
     """
 
     def __init__(

@@ -88,18 +88,19 @@ def test_half_precision_is_as_near_to_the_layers_as_rounding_allows(name):
     )
 
 
-def test_pictures_in_parts_on_threads_give_the_same_bits(threads):
-    net = sensor_net(picture=(1, 32, 32), strides=(4, 1, 1), kernels=(8, 2, 2))
+@pytest.mark.parametrize("half_precision", [False, True])
+def test_pictures_in_parts_on_threads_give_the_same_bits(threads, half_precision):
+    net = sensor_net(picture=(1, 32, 32), strides=(4, 1, 1), kernels=(8, 2, 2), half_precision=half_precision)
     pictures = torch.randint(0, 256, (2 * PART + 3, 1, 32, 32), dtype=torch.uint8)
+    convolutions = sum(weight.numel() for weight in net.convolutions.parameters())
+    expected, expected_gradients = outputs_and_gradients(net, pictures, plainly(net))
     found = []
     for number in (1, 3):
         threads(number)
-        plain, plain_gradients = outputs_and_gradients(net, pictures, plainly(net))
-        convolved = outputs_and_gradients(net, pictures, net)
-        assert relative_error(convolved[0], plain) < 1e-5
-        assert relative_error(convolved[1], plain_gradients) < 1e-5
-        count = sum(weight.numel() for weight in net.convolutions.parameters())
-        found.append(convolved[1][:count])
+        outputs, gradients = outputs_and_gradients(net, pictures, net)
+        assert relative_error(outputs, expected) < (0.03 if half_precision else 1e-5)
+        assert relative_error(gradients, expected_gradients) < (0.2 if half_precision else 1e-5)
+        found.append(gradients[:convolutions])
     assert torch.equal(*found)
 
 
