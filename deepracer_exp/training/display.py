@@ -22,6 +22,8 @@ Row = Mapping[str, float | int | None]
 SPARKS = "▁▂▃▄▅▆▇█"
 REFRESH_S = 0.2
 """Shortest time between two drawings: more often only costs the training time."""
+_MOVE_S = 5.0
+"""Time after which the view is drawn again, with the time that has passed, however long an iteration takes."""
 LINE_S = 5.0
 """Shortest time between two plain lines; from two minutes on it grows with the run, up to `_LINE_AT_MOST_S`."""
 _LINE_AT_MOST_S = 60.0
@@ -116,22 +118,26 @@ class ProgressDisplay:
         self, console: Console, header: RunHeader, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._console, self._header, self._clock = console, header, clock
-        # A terminal with TERM=dumb cannot draw in place.
-        self._live = Live(console=console, auto_refresh=False) if console.is_interactive else None
         self._started_s, self._shown_s = 0.0, -math.inf
         self._pending = False
         self._row: Row = {}
         self._evaluated: Row = {}
-        self._fraction = self._elapsed_s = 0.0
+        self._fraction = 0.0
         self._eta_s: float | None = None
         self._history: dict[str, list[float]] = {label: [] for label in _CURVES}
         self._tracks = TrackTable(header.track_labels)
+        # A terminal with TERM=dumb cannot draw in place. The view is drawn by a thread, too: what it reads is replaced
+        # or added to, and needs no lock, which a signal's answer could find taken.
+        self._live = (
+            Live(console=console, get_renderable=self._panel, refresh_per_second=1 / _MOVE_S)
+            if console.is_interactive
+            else None
+        )
 
     def __enter__(self) -> Self:
         self._started_s = self._clock()
         if self._live is not None:
-            self._live.start()
-            self._live.update(self._panel(), refresh=True)
+            self._live.start(refresh=True)
         else:
             self._print(f"{self._header.name}: {self._header} · {self._header.budget}")
             self._print(f"results in {self._header.folder}")
@@ -153,7 +159,7 @@ class ProgressDisplay:
             eta_s: seconds left, or None if unknown.
         """
         now_s = self._clock()
-        self._row, self._eta_s, self._elapsed_s = row, eta_s, now_s - self._started_s
+        self._row, self._eta_s = row, eta_s
         self._fraction = min(max(fraction, 0.0), 1.0)
         for label, values in self._history.items():
             value = _value(row, _FIGURES[label][0])
@@ -163,7 +169,7 @@ class ProgressDisplay:
             self._evaluated = row  # stays until the next evaluation
         self._tracks.add(row)
         self._pending = True
-        line_s = min(max(LINE_S, _LINE_SHARE * self._elapsed_s), _LINE_AT_MOST_S)
+        line_s = min(max(LINE_S, _LINE_SHARE * (now_s - self._started_s)), _LINE_AT_MOST_S)
         if now_s - self._shown_s >= (line_s if self._live is None else REFRESH_S):
             self._shown_s = now_s
             self._show()
@@ -171,7 +177,7 @@ class ProgressDisplay:
     def _show(self) -> None:
         self._pending = False
         if self._live is not None:
-            self._live.update(self._panel(), refresh=True)
+            self._live.refresh()
         else:
             self._print(self._line())
 
@@ -234,7 +240,7 @@ class ProgressDisplay:
         if width >= _HALVES - 6:
             limit = self._header.budget if width >= _WIDE - 6 else "budget"
             spent.append(f" of {limit}", style="dim")
-            left = f"{_clock(self._elapsed_s)} · {left}"
+            left = f"{_clock(self._clock() - self._started_s)} · {left}"
         row = Table.grid(padding=(0, 2), expand=True)
         row.width = width
         row.add_column(ratio=1, min_width=4)

@@ -365,7 +365,8 @@ def _ended(trainer: Trainer, interruption: Interruption) -> TrainResult:
         raise
     except KeyboardInterrupt:
         # No checkpoint, since an update may be half done, and no pictures.
-        ending = Ending(INTERRUPTED, "ended at once by a second signal")
+        reason = "without the iteration in progress" if interruption.left_out else "by a second signal"
+        ending = Ending(INTERRUPTED, f"ended at once {reason}")
         return trainer.end(ending, interruption.exit_code or 130)
     except Exception as error:
         if is_refused_memory(error):

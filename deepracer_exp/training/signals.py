@@ -1,14 +1,26 @@
-"""Ctrl-C and SIGTERM, acted on at the end of an iteration."""
+"""Ctrl-C and SIGTERM, acted on at the end of an iteration, or without it if it takes long."""
 
 import signal
+import threading
+import time
 from collections.abc import Callable
 from types import FrameType
 
 from deepracer_exp.rewards.guard import CtrlC
 
+PATIENCE_S = 6.0
+"""Seconds after a signal at which an iteration that can be left out is; to end the workers takes some more."""
+_LOOK_EVERY_S = 0.1
+
 
 class Interruption:
     """Records a request to end and answers it; a second signal ends at once.
+
+    So does patience: once it is over, the iteration in progress is left out if that loses nothing else.
+
+    Attributes:
+        may_leave_out: whether all but the iteration in progress is stored.
+        left_out: whether the iteration in progress was left out.
 
     Where one is entered within another, as a training within a worker of a sweep, both have the same request.
     """
@@ -20,6 +32,9 @@ class Interruption:
         """
         self._answer = answer
         self.signum: int | None = None
+        self.may_leave_out = self.left_out = False
+        self._asked, self._over = threading.Event(), threading.Event()
+        self._patience = threading.Thread(target=self._lose_patience, name="patience", daemon=True)
         self._before: dict[int, object] = {}
         self._outer: Interruption | None = None
 
@@ -30,9 +45,13 @@ class Interruption:
             outer = getattr(before, "__self__", None)
             if isinstance(outer, Interruption):
                 self._outer, self.signum = outer, outer.signum
+        self._patience.start()
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._asked.set()
+        self._patience.join()
         for signum, handler in self._before.items():
             signal.signal(signum, handler)  # type: ignore[arg-type]
 
@@ -45,9 +64,22 @@ class Interruption:
         if self.signum is not None:
             raise CtrlC
         self.signum = signum
+        self._asked.set()
         if self._outer is not None:
             self._outer.signum = signum
         if self._answer is not None:
             self._answer(
-                "stopping: this iteration is finished and its policy evaluated; Ctrl-C again ends at once"
+                "stopping: this iteration is finished and its policy evaluated, or, if it takes more than "
+                f"{PATIENCE_S:.0f} s and the one before is stored, left out; Ctrl-C again ends at once"
             )
+
+    def _lose_patience(self) -> None:
+        """Send the main thread a second signal when it is time to."""
+        self._asked.wait()
+        at_s = time.monotonic() + PATIENCE_S
+        while not self._over.wait(_LOOK_EVERY_S):
+            if self.may_leave_out and time.monotonic() >= at_s:
+                self.left_out = True
+                # To that thread: a call in which it waits is to return.
+                signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+                return

@@ -155,7 +155,8 @@ class Trainer:
     def fit(self, interruption: Interruption) -> Ending:
         """Train until there is a reason to stop, and return it.
 
-        `interruption` must have been entered; a signal to it ends the loop after the iteration in progress.
+        `interruption` must have been entered; a signal to it ends the loop after the iteration in progress, or without
+        it if that takes long.
 
         Raises:
             RunFailed: a worker was lost, a number became NaN or infinite, or the disk is full.
@@ -165,6 +166,8 @@ class Trainer:
         with self.running:
             collector = self._start()
             while collector is not None and self.ending is None:
+                interruption.may_leave_out = self.saved_steps == self.env_steps
+
                 # 1. Collect: count steps and episodes; the networks are still those that drove.
                 batch, collect_s = collector.collect(self.experiment.algorithm)
                 rows, finished = self.metrics.enter(batch["next", "trace"].numpy())
@@ -195,6 +198,7 @@ class Trainer:
                     collector.publish_rivals(self.rivals.driving)
 
                 # 5. Save when due and at the end.
+                interruption.may_leave_out = False
                 is_due = (
                     self.iteration % _LAST_EVERY == 0 or time.monotonic() > self._saved_at + _LAST_EVERY_S
                 )
@@ -273,6 +277,7 @@ class Trainer:
         read_agent(checkpoint, self.agent)
         self.checkpoints.restore_replay(self.agent)
         self.iteration, self.env_steps = state["iteration"], state["env_steps"]
+        self.saved_steps = self.env_steps
         self.metrics.load_state_dict(state["results"])
         self._first_lap, self._cars = state["first_lap"], state["cars"]
         self._began -= state["wall_clock_s"]

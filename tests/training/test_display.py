@@ -20,6 +20,7 @@ from deepracer_exp.training.display import (
     TrackTable,
     sparkline,
 )
+from tests.waiting import wait_until
 
 HEADER = RunHeader(
     **{"name": "default", "track": "re:Invent 2018", "track_labels": (), "remembered": 20},
@@ -135,6 +136,17 @@ def test_without_a_terminal_there_are_single_plain_lines():
     assert "\x1b" not in "".join(written)
     words = ["67%", "655,360 steps", "15,096/s", "82.58", "99.5%", "525", "96%", "9.33 s", "0:23 left"]
     assert not [word for word in words if word not in written[2]]
+
+
+def test_the_time_on_a_terminal_moves_while_an_iteration_takes_long(monkeypatch):
+    monkeypatch.setattr("deepracer_exp.training.display._MOVE_S", 0.01)
+    clock, file = Clock(), io.StringIO()
+    console = Console(file=file, force_terminal=True, width=100, height=30, legacy_windows=False)
+    with ProgressDisplay(console, HEADER, clock) as display:
+        display.update(ROW, 0.67, 23.0)
+        assert "1:15" not in file.getvalue()
+        clock.now_s += 75.0
+        wait_until(lambda: "1:15" in file.getvalue(), "the time to move")
 
 
 def test_a_terminal_that_cannot_draw_in_place_gets_plain_lines(monkeypatch):

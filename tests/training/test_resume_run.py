@@ -1,20 +1,25 @@
 """`deepracer-exp resume`: the rest of a run is what it would have been."""
 
 import json
+import os
 import shutil
+import signal
 
 import pytest
 import torch
 import yaml
 from mlflow import MlflowClient
 
+from deepracer_exp.agents.ppo import PPO
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.lookup.resolve import resolve
 from deepracer_exp.runs.checkpoints import check, checkpoint_name, read_checkpoint
 from deepracer_exp.runs.files import read_metrics, read_object
 from deepracer_exp.runs.folder import RunFolder
+from deepracer_exp.training import signals
 from deepracer_exp.training.trainer import Trainer
 from tests.conftest import IN_PROCESS
+from tests.waiting import wait_until
 
 from .conftest import assert_same_run
 
@@ -300,3 +305,29 @@ def test_a_reward_function_with_a_memory_is_reported_and_one_that_was_changed_re
     assert "will not be that of an uninterrupted run: the reward function memory keeps" in ended.stderr
     file.write_text(reward.replace("1.0", "2.0"))
     call("resume", run.name, "budget.iterations=4").assert_refused("reward memory has other contents")
+
+
+def test_an_iteration_that_an_interruption_left_out_is_driven_by_resume(
+    trained, train_here, call, monkeypatch
+):
+    often = (*OFTEN, "checkpoints.every=1", "budget.env_steps=null", "budget.iterations=3", "stopping=none")
+    uninterrupted = trained(*often)
+    update = PPO.update
+
+    def interrupted(agent, batch, iteration, fraction):
+        if iteration == 1:
+            os.kill(os.getpid(), signal.SIGINT)
+            wait_until(lambda: False, "end of this iteration")
+        return update(agent, batch, iteration, fraction)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(signals, "PATIENCE_S", 0.0)
+        patched.setattr(PPO, "update", interrupted)
+        ended = train_here(*often)
+    assert ended.code == 130
+    assert ended.summary["status"] == "interrupted"
+    assert ended.summary["reason"] == "ended at once without the iteration in progress"
+    assert [row["iteration"] for row in rows(ended.folder)] == [1]
+    resumed = call("resume", ended.folder.name)
+    assert resumed.code == 0, resumed.stderr
+    assert_same_run(ended.folder, uninterrupted.folder)
