@@ -50,7 +50,7 @@ class _InParts(torch.autograd.Function):
     """Convolves and differentiates each part on its own; arguments as of `convolve`, and weights with gradients."""
 
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any, layers: nn.Sequential, pictures: Tensor, dtype: torch.dtype, *weights: Tensor
     ) -> Tensor:
         def with_graph(part: Tensor) -> Tensor:
@@ -61,7 +61,7 @@ class _InParts(torch.autograd.Function):
         return torch.cat([part.detach() for part in ctx.parts])
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         def by_weights(part: tuple[Tensor, Tensor]) -> tuple[Tensor, ...]:
             # Another loss may want the gradients of the same outputs.
             return torch.autograd.grad(part[0], ctx.weights, part[1], retain_graph=True)
@@ -83,7 +83,7 @@ def _convolve(layers: nn.Sequential, pictures: Tensor, dtype: torch.dtype) -> Te
         else:
             blocks = _blocks(pictures, stride).to(dtype)
             values = functional.conv2d(blocks, _of_blocks(weight, stride), first.bias)
-        for layer in layers[1:]:
+        for layer in list(layers)[1:]:
             # Nothing but the activation needs what it is computed from.
             values = functional.relu_(values) if isinstance(layer, nn.ReLU) else layer(values)
         return values.flatten(1)

@@ -41,7 +41,11 @@ class _Loss(ClipPPOLoss):
     finite, which would end in an error of torch.multinomial instead of the name of what is not finite.
     """
 
+    acted: Distribution
+    """The policy's in the last minibatch."""
+
     def _get_entropy(self, dist: Distribution, adv_shape: torch.Size) -> Tensor:
+        self.acted = dist
         return dist.entropy().unsqueeze(-1)
 
 
@@ -131,7 +135,9 @@ class PPO(Algorithm):
         """
         losses = self._loss(minibatch)
         if self._smoothness is not None:
-            losses["loss_smoothness"] = self._smoothness(minibatch, losses["loss_objective"])
+            losses["loss_smoothness"] = self._smoothness(
+                minibatch, losses["loss_objective"], self._loss.acted
+            )
         return losses
 
     def update(self, batch: TensorDictBase, iteration: int, fraction: float) -> UpdateMetrics:
@@ -196,7 +202,9 @@ class PPO(Algorithm):
             self._smoothness.load_state_dict(state["smoothness"])
 
     def _shuffled(self, count: int) -> Tensor:
-        return torch.randperm(count, generator=self._generator).to(self._device)
+        in_pairs = self._smoothness is not None and self._smoothness.in_pairs
+        shuffle = Smoothness.pairs if in_pairs else torch.randperm
+        return shuffle(count, generator=self._generator).to(self._device)
 
     @torch.no_grad()
     def _prepare(self, batch: TensorDictBase) -> tuple[TensorDictBase, float]:

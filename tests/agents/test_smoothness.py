@@ -103,7 +103,7 @@ def loss_of(networks: ActorCritic) -> float:
     observation = torch.tensor([[5.0, 0, 0, 0], [-5.0, 0, 0, 0]]).repeat(8, 1)
     steps = TensorDict({"observation": observation, "successor": {"observation": -observation}}, [16])
     loss._weight = torch.ones(())
-    return loss(steps, torch.zeros(())).item()
+    return loss(steps, torch.zeros(()), networks.policy.get_dist(steps)).item()
 
 
 LEFT, RIGHT, EITHER = [-9.0, -9.0, 9.0], [9.0, -9.0, -9.0], [5.0, -5.0, 5.0]
@@ -124,7 +124,7 @@ def test_it_costs_the_same_to_turn_in_one_step_as_in_several():
     at_once = torch.tensor([[0.0, 0.0], [0.0, 0.0], [1.0, 0.0]])
     slowly = torch.tensor([[0.0, 0.0], [0.5, 0.0], [1.0, 0.0]])
     back_and_forth = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]])
-    costs = [loss._distance(one[1:], one[:-1]).item() for one in (at_once, slowly, back_and_forth)]
+    costs = [loss._distance(one[1:], one[:-1]).mean().item() for one in (at_once, slowly, back_and_forth)]
     assert costs[0] == pytest.approx(costs[1], rel=0.02)
     assert costs[2] == pytest.approx(2 * costs[0], rel=0.02)
 
@@ -201,7 +201,7 @@ def test_a_teacher_is_imitated_as_without_it():
     assert torch.equal(*results)
 
 
-def test_a_picture_has_variants_that_are_pictures_of_the_same_place():
+def pictures_network(actions: int | None = 3) -> ActorCritic:
     network = CNNConfig(
         filters=(4,),
         kernels=(4,),
@@ -213,23 +213,59 @@ def test_a_picture_has_variants_that_are_pictures_of_the_same_place():
         initial_std=0.5,
     )
     observed = ObservationShape(4, (1, 24, 32), 8)
-    networks = build_actor_critic(network, observed, 3, torch.Generator().manual_seed(0))
+    return build_actor_critic(network, observed, actions, torch.Generator().manual_seed(0))
+
+
+def test_a_picture_has_variants_that_are_pictures_of_the_same_place():
+    networks = pictures_network()
     loss = Smoothness(networks, 1.0, COMMANDS, 0, torch.device("cpu"))
     ramp = torch.arange(24 * 32).reshape(1, 1, 24, 32) * 200 // (24 * 32) + 20
     seen = {"pixels": ramp.to(torch.uint8).repeat(6, 1, 1, 1), "lidar": torch.rand(6, 8)}
-    steps = TensorDict({**seen, "successor": copy.deepcopy(seen)}, [6])
-    variant = loss._variant(steps)
+    variant = loss._variant(TensorDict(seen, [6]))
     assert variant["pixels"].dtype == torch.uint8
     assert variant["pixels"].shape == seen["pixels"].shape
     for before, after in zip(seen["pixels"].float(), variant["pixels"].float(), strict=True):
         assert 0 < (before - after).abs().mean() < 40
         assert torch.corrcoef(torch.stack([before.flatten(), after.flatten()]))[0, 1] > 0.95
     assert 0 < (variant["lidar"] - seen["lidar"]).abs().max() < 0.05
-    objective = networks.policy.get_dist_params(steps)["logits"].square().mean()
-    found = loss(steps, objective)
-    assert found.item() > 0
+
+
+@pytest.mark.parametrize("actions", [3, None])
+def test_pictures_are_compared_with_those_beside_them_in_the_minibatch(actions):
+    networks = pictures_network(actions)
+    loss = Smoothness(networks, 1.0, COMMANDS if actions else None, 0, torch.device("cpu"))
+    assert loss.in_pairs
+    pixels = torch.randint(0, 256, (2, 4, 1, 24, 32), dtype=torch.uint8)
+    done = torch.zeros(2, 4, 1, dtype=torch.bool)
+    done[0, 2] = True
+    batch = TensorDict({"pixels": pixels, "lidar": torch.rand(2, 4, 8), "next": {"done": done}}, [2, 4])
+    steps = batch.select("pixels", "lidar").reshape(-1)
+    loss.prepare(steps, batch)
+    order = torch.tensor(
+        [2, 3, 0, 1, 4, 5, 3, 4]
+    )  # 2 ended an episode, 4 is another car's, 1 and 4 are no pair
+    minibatch = steps[order]
+    acted = networks.policy.get_dist(minibatch)
+    seed = loss._generator.get_state()
+    objective = sum(part.square().mean() for part in networks.policy.get_dist_params(minibatch).values())
+    found = loss(minibatch, objective, acted)
+    shown = networks.policy.get_dist_params(steps)
+    ours = loss._actions(shown)
+    pairs = [(0, 1), (4, 5)]
+    expected = torch.stack([loss._distance(ours[[a]], ours[[b]])[0] for a, b in pairs]).mean()
+    loss._generator.set_state(seed)
+    varied = loss._actions(networks.policy.get_dist_params(loss._variant(minibatch[::4])))
+    expected = expected + loss._distance(ours[order[::4]], varied).mean()
+    assert found.item() == pytest.approx((loss._weight * expected).item(), rel=1e-3)
     found.backward()
     assert any(one.grad is not None and one.grad.any() for one in networks.policy.parameters())
+
+
+@pytest.mark.parametrize("count", [1, 8, 9])
+def test_pairs_are_all_steps_in_another_order(count):
+    order = Smoothness.pairs(count, torch.Generator().manual_seed(0)).tolist()
+    assert sorted(order) == list(range(count))
+    assert all(order[order.index(step) + 1] == step + 1 for step in range(0, count - 1, 2))
 
 
 def test_a_policy_gone_bad_is_named_before_the_gradient_step():
