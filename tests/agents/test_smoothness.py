@@ -241,13 +241,12 @@ def test_pictures_are_compared_with_those_beside_them_in_the_minibatch(actions):
     batch = TensorDict({"pixels": pixels, "lidar": torch.rand(2, 4, 8), "next": {"done": done}}, [2, 4])
     steps = batch.select("pixels", "lidar").reshape(-1)
     loss.prepare(steps, batch)
-    order = torch.tensor(
-        [2, 3, 0, 1, 4, 5, 3, 4]
-    )  # 2 ended an episode, 4 is another car's, 1 and 4 are no pair
+    # 2 ended an episode, 4 is another car's, and 1 and 4 are no pair.
+    order = torch.tensor([2, 3, 0, 1, 4, 5, 3, 4])
     minibatch = steps[order]
     acted = networks.policy.get_dist(minibatch)
     seed = loss._generator.get_state()
-    objective = sum(part.square().mean() for part in networks.policy.get_dist_params(minibatch).values())
+    objective = (acted.logits if actions else acted.mean).square().mean()
     found = loss(minibatch, objective, acted)
     shown = networks.policy.get_dist_params(steps)
     ours = loss._actions(shown)
