@@ -25,6 +25,7 @@ from deepracer_exp.sim.scenery import (
     START_LENGTH_M,
     START_WIDTH_M,
     paved_area,
+    wall_material,
     wall_ring,
 )
 from deepracer_exp.tracks.track import Track
@@ -93,7 +94,7 @@ def build_scene(
     for a, b in pairwise(ring):
         (x, y), length = b - a, float(np.linalg.norm(b - a))
         outwards = np.array([y, -x]) / length
-        wall = "wall_y" if y == 0 and not track.floor.walls_follow_road else "wall_x"
+        wall = MATERIALS[wall_material(track, ring, a, b)]
         middle = 0.5 * (a + b) + thick * outwards
         _add_box(spec, wall, (*middle, tall), (0.5 * length, thick, tall), np.arctan2(y, x))
     standing = [] if boxes is None else [box for box in boxes.astype(float) if box[5] > 0]

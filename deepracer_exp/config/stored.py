@@ -12,6 +12,7 @@ from .compose import Composition, compose_entry
 from .options import groups
 from .overrides import OPEN_MAPPINGS, parse_single
 from .own_class import allow, allow_given
+from .rooms import in_rooms
 
 _WHOLE = ("experiment", custom_files.KEY)
 ABSENT = "\N{EN DASH}"
@@ -40,7 +41,7 @@ def with_overrides(
     parts = [override for override in overrides if override.startswith("observation.target=")]
     if not stored:
         allow_given(parts)
-    parsed = [parse_single(override) for override in overrides if override not in parts]
+    parsed = in_rooms([parse_single(override) for override in overrides if override not in parts])
     values = without_passwords(dict(config))
     left_out = acting.leave_out_foreign(values, "the stored run")
     chosen = [

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, Tag
 
-from .bounds import Finite, Positive
+from .bounds import Finite, NonNegative, Positive
 
 Point = tuple[Finite, Finite]
 Color = Annotated[str, Field(pattern=r"^#[0-9a-fA-F]{6}$")]
@@ -32,6 +32,7 @@ class FloorConfig:
     walls_beyond_m: Positive | None = 0.91
     walls_height_m: Positive = 1.0
     walls_follow_road: bool = False
+    walls_light: tuple[NonNegative, NonNegative, NonNegative, NonNegative] = (1.0, 0.3, 1.0, 0.3)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,12 +18,12 @@ QUANTITIES = tuple(field.name for field in fields(PictureRandomizationConfig))
 _COLUMN = {name: column for column, name in enumerate(QUANTITIES)}
 _LENS, _OTHERS = _COLUMN["lens_k1"], _COLUMN["others_scale"]
 _OFF = np.array([1.0 if name.endswith("_scale") else 0.0 for name in QUANTITIES])
-_FIRST_QUANTITIES, _FIRST_MATERIALS = 10, 8
+_FIRST_QUANTITIES, _FIRST_MATERIALS, _DRAWN_MATERIALS = 10, 8, 12
 """Quantities and materials added later are drawn after everything else, so that they change no earlier draw. The lens
 and the looks of others were added after the objects, which draw a varying number of values, and so have streams of
 their own."""
-_FACTOR_OF = [MATERIALS.index(name.removeprefix("far_")) for name in MATERIALS]
-"""Whose colour factor a material has: farther ahead a line keeps its colour."""
+_FACTOR_OF = [MATERIALS.index(name.removeprefix("far_").replace("high", "low")) for name in MATERIALS]
+"""Whose colour factor a material has: farther ahead a line keeps its colour, and opposite walls have the same."""
 _MIDDLE = 127.5
 _SPOT_SIZE = (0.1, 0.5)
 """Standard deviation of a shadow or spot of light, as a share of the picture's width."""
@@ -106,7 +106,7 @@ class PictureRandomization:
             sign, x, y, size = stream.random(4)
             self._noise_start[car] = stream.integers(_NOISE_NUMBERS)
             stream.random(out=draws[_FIRST_QUANTITIES:_LENS])
-            stream.standard_normal(out=normal[_FIRST_MATERIALS:])
+            stream.standard_normal(out=normal[_FIRST_MATERIALS:_DRAWN_MATERIALS])
             draws[_LENS] = self._lens_streams.stream(car, episode).random()
             draws[_OTHERS] = 0.0  # each other has one of its own
             values = self._low[car] + self._span[car] * draws

@@ -22,8 +22,7 @@ from .real_car import AS_SIMULATED, FRAME_SCALE, car_pictures
 
 GREY = np.array([0.299, 0.587, 0.114], np.float32)
 """Weights of red, green and blue in the service's grey (ITU-R BT.601; deepracer-simapp turns RGB into luminance)."""
-_WALL_Y_LIGHT = 0.3
-"""Brightness of the walls along the x axis relative to the others, in recorded frames (`benchmarks.camera`)."""
+_WALLS = ("wall_low_x", "wall_low_y", "wall_high_x", "wall_high_y")
 _FRAMES_AT_ONCE, _PICTURES_AT_ONCE = 16, 256
 """Frames of the physical car's camera, and pictures of the simulator's, that one thread takes at once: 5 MB in grey."""
 
@@ -211,8 +210,9 @@ def floor_colors(floor: FloorConfig) -> NDArray[np.float32]:
         "line": line,
         "dash": dash,
         "far_dash": road + dashes * (dash - road),
-        "wall_x": wall,
-        "wall_y": _WALL_Y_LIGHT * wall,
+        **{
+            name: np.minimum(light * wall, 255) for name, light in zip(_WALLS, floor.walls_light, strict=True)
+        },
         "kerb": kerb,
         "far_kerb": 0.5 * (kerb + line),
         "start": start,

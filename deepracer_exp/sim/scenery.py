@@ -36,18 +36,20 @@ MATERIALS = (
     "line",
     "dash",
     "far_dash",
-    "wall_x",
-    "wall_y",
+    "wall_low_x",
+    "wall_low_y",
     "kerb",
     "far_kerb",
     "start",
     "far_start",
+    "wall_high_x",
+    "wall_high_y",
 )
-"""Parts that have a colour of their own: `far_dash` is the centre line where dashes run together, and so on; `wall_x`
-are the walls that face along the x axis, `start` the start line's dark fields."""
-SKY, FIELD, ROAD, LINE, DASH, FAR_DASH, WALL_X, WALL_Y, KERB, FAR_KERB, START, FAR_START = range(
-    len(MATERIALS)
-)
+"""Parts that have a colour of their own: `far_dash` is the centre line where dashes run together, and so on;
+`wall_low_x` is the wall of a rectangle at the lowest x, `start` the start line's dark fields. A barrier that follows
+the road is all `wall_low_x`."""
+SKY, FIELD, ROAD, LINE, DASH, FAR_DASH, WALL_LOW_X, WALL_LOW_Y, *_REST = range(len(MATERIALS))
+KERB, FAR_KERB, START, FAR_START, WALL_HIGH_X, WALL_HIGH_Y = _REST
 
 DASHES_UNTIL_M = 2.0
 """Distance from which dashes run together: a row of the picture sees more than one of them."""
@@ -98,7 +100,7 @@ def build_scenery(track: Track) -> Scenery:
         drawing.add(([field], FIELD, SKY))
     else:
         for (ax, ay), (bx, by) in pairwise(ring):
-            wall = WALL_Y if ay == by and not floor.walls_follow_road else WALL_X
+            wall = wall_material(track, ring, (ax, ay), (bx, by))
             z = floor.walls_height_m
             # Counter-clockwise in the picture of a camera between the walls.
             drawing.add(([np.array([[ax, ay, 0], [ax, ay, z], [bx, by, z], [bx, by, 0]])], wall, SKY))
@@ -151,6 +153,17 @@ def wall_ring(track: Track) -> NDArray[np.float64] | None:
     )
     (ring,) = rings_of(around)
     return ring
+
+
+def wall_material(
+    track: Track, ring: NDArray[np.float64], begin: Sequence[float], end: Sequence[float]
+) -> int:
+    """Return the material of the wall from `begin` to `end`, neighbours in the track's `wall_ring`, (n, 2)."""
+    if track.floor.walls_follow_road:
+        return WALL_LOW_X
+    if begin[0] == end[0]:
+        return WALL_LOW_X if begin[0] == ring[:, 0].min() else WALL_HIGH_X
+    return WALL_LOW_Y if begin[1] == ring[:, 1].min() else WALL_HIGH_Y
 
 
 def paved_area(track: Track, kerb_m: float = KERB_WIDTH_M) -> BaseGeometry:

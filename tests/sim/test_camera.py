@@ -97,8 +97,17 @@ def followed(track: Track, pose: np.ndarray, lens: Lens, per_pixel: int) -> np.n
         speed = ahead[..., :2] @ outwards.T
         reached = np.where(speed > 0, ((ring[:-1] - eye[:2]) * outwards).sum(axis=1) / speed, np.inf)
     wall = reached.min(axis=-1)
-    along_x = (sides[:, 1] == 0) & (not track.floor.walls_follow_road)
-    seen = np.where(along_x, MATERIALS.index("wall_y"), MATERIALS.index("wall_x"))[reached.argmin(axis=-1)]
+    # A rectangle's sides, counter-clockwise, lead up the high x, then back along the high y, and so on.
+    by_direction = {
+        (0, 1): "wall_high_x",
+        (-1, 0): "wall_high_y",
+        (0, -1): "wall_low_x",
+        (1, 0): "wall_low_y",
+    }
+    names = [
+        "wall_low_x" if track.floor.walls_follow_road else by_direction[tuple(s)] for s in np.sign(sides)
+    ]
+    seen = np.array([MATERIALS.index(name) for name in names])[reached.argmin(axis=-1)]
     seen[eye[2] + wall * ahead[..., 2] > track.floor.walls_height_m] = MATERIALS.index("sky")
     on_floor = floor < wall
     at = eye[:2] + floor[on_floor][:, None] * ahead[on_floor][:, :2]
@@ -240,7 +249,7 @@ def test_a_raceway_has_lines_outside_its_border_kerbs_a_start_line_and_a_barrier
         ["line", "kerb", "far_kerb"],
         ["start"],
         ["field"],
-        ["wall_x"],
+        ["wall_low_x"],
         ["sky"],
     ]
     for group in groups:
