@@ -276,7 +276,9 @@ def box(
 
 def boxed(*boxes: list[float]) -> np.ndarray:
     """Return the grey picture with boxes, (height, width)."""
-    colors = np.linspace(30, 220, len(MATERIALS), dtype=np.float32)[None, :, None]
+    greys = np.linspace(30, 220, 12, dtype=np.float32)
+    opposite = [MATERIALS.index(name) for name in ("wall_low_x", "wall_low_y")]
+    colors = np.append(greys, greys[opposite])[None, :, None]
     out = np.empty((1, 1, LENS.height, LENS.width), np.uint8)
     some = np.array([boxes], np.float32) if boxes else None
     scenery = SCENERIES["reinvent_base"]
