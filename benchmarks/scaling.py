@@ -44,6 +44,7 @@ from deepracer_exp.tracking.store_thread import UPDATE_S
 
 from .command import command_line
 from .report import benchmark_parser, number, percent, table, write_json
+from .scaling_costs import costs, cpu_s, host_and_port, server
 from .scaling_load import Measured, SimulatedLauncher, Template
 
 _REQUEST = re.compile(rb"(GET|POST|PUT|PATCH) (/\S*) HTTP/1\.1\r\n")
@@ -153,12 +154,6 @@ def real_sweep(args: argparse.Namespace, folder: Path) -> tuple[Path, dict[str, 
     }
 
 
-def host_and_port(url: str, port: int) -> tuple[str, int]:
-    """Return where a server listens."""
-    found = sa.make_url(url)
-    return found.host or "127.0.0.1", found.port or port
-
-
 def size(path: Path) -> int:
     """Return the bytes of the files below a folder."""
     return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
@@ -210,10 +205,12 @@ def load(args: argparse.Namespace, folder: Path, template: Template, workers: in
     used, window = Used(args, storage, launcher), [time.monotonic()]
     ended = sum(claim.has_ended for claim in TrialClaims(storage.engine, name).all())
     peak = used.connections()
-    while time.monotonic() < window[0] + args.measure_s:
+    moments = [*window]
+    while moments[-1] < window[0] + args.measure_s:
         time.sleep(1.0)
         peak = max(peak, used.connections())
-    window.append(time.monotonic())
+        moments.append(time.monotonic())
+    window.append(moments[-1])
     found = used.since_then()
     ended = sum(claim.has_ended for claim in TrialClaims(storage.engine, name).all()) - ended
     held = len(expired)
@@ -228,6 +225,7 @@ def load(args: argparse.Namespace, folder: Path, template: Template, workers: in
         "workers": workers,
         "warmup_s": window[0] - began,
         "measure_s": seconds,
+        "longest_pause_s": float(np.diff(moments).max()),
         "trials_a_minute": 60 * ended / seconds,
         "expired_leases": held,
         "renewals_by_workers": len(mine.within("renewal by a worker itself", bounds)),
@@ -306,32 +304,6 @@ class Used:
             return int(connection.execute(sa.text(question)).scalar_one())
 
 
-def server(port: int, program: str) -> psutil.Process:
-    """Return the process of this machine that has started those which listen on a port."""
-    listening = next(
-        one.pid
-        for one in psutil.net_connections("tcp")
-        if one.status == psutil.CONN_LISTEN and one.laddr.port == port and one.pid
-    )
-    first = psutil.Process(listening)
-    for parent in first.parents():
-        if program in " ".join(parent.cmdline()):
-            first = parent
-    return first
-
-
-def cpu_s(process: psutil.Process) -> float:
-    """Return the processor time of a process and of all that it has started, those that have ended among them."""
-    total = 0.0
-    for one in (process, *process.children(recursive=True)):
-        try:
-            times = one.cpu_times()
-        except psutil.NoSuchProcess:
-            continue
-        total += times.user + times.system + times.children_user + times.children_system
-    return total
-
-
 def main() -> None:
     """Measure, print and write."""
     parser = benchmark_parser("scaling", __doc__, None)
@@ -339,15 +311,21 @@ def main() -> None:
     parser.add_argument("--tracking", required=True, help="an MLflow server")
     parser.add_argument("--trials", type=int, default=2, help="of the real sweep")
     parser.add_argument("--iterations", type=int, default=20, help="of each of its trials")
+    parser.add_argument("--calls", type=int, default=100, help="of each kind whose cost is measured")
     parser.add_argument("--run", type=Path, help="a run of an earlier sweep, in place of the real sweep")
-    parser.add_argument("--workers", type=int, nargs="+", default=(100, 250, 500, 1000), help="of the loads")
-    parser.add_argument("--warmup-s", type=float, default=60.0)
+    parser.add_argument("--workers", type=int, nargs="*", default=(100, 250, 500, 1000), help="of the loads")
+    parser.add_argument("--warmup-s", type=float, default=30.0)
     parser.add_argument("--measure-s", type=float, default=120.0)
     args = parser.parse_args()
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     with tempfile.TemporaryDirectory() as work:
         folder = Path(work)
         demanded, loads = dict[str, Any](), list[dict[str, Any]]()
+        cost = costs(args.storage, args.tracking, args.calls, folder)
+        calls = [
+            [name, number(one["postgresql_ms"], 2), number(one["mlflow_ms"], 2)] for name, one in cost.items()
+        ]
+        print(table(["CPU time of a call, ms", "PostgreSQL", "MLflow"], calls), flush=True)
         if args.run is None:
             args.run, demanded = real_sweep(args, folder)
             rows = [
@@ -359,7 +337,7 @@ def main() -> None:
         for workers in args.workers:
             loads.append(load(args, folder / "runs", Template(args.run, 100, _EVERY), workers))
             print(f"\n{shown(loads[-1])}", flush=True)
-            write_json(args.json, {"trials": args.trials, "sweep": demanded, "loads": loads})
+            write_json(args.json, {"costs": cost, "trials": args.trials, "sweep": demanded, "loads": loads})
 
 
 def shown(found: dict[str, Any]) -> str:
@@ -375,7 +353,7 @@ def shown(found: dict[str, Any]) -> str:
     return "\n".join(
         [
             f"{found['workers']} workers, {found['trials_a_minute']:.0f} trials a minute, {found['measure_s']:.0f} s; "
-            f"load average {found['load_average']:.1f}",
+            f"load average {found['load_average']:.1f}, longest pause {found['longest_pause_s']:.1f} s",
             f"leases expired: {found['expired_leases']}; renewed by workers themselves: {found['renewals_by_workers']}",
             f"late rows: {percent(late, 1)}; failures: {len(found['failures'])} {found['failures'][:1] or ''}",
             f"cores used: {cores}",

@@ -47,7 +47,7 @@ from deepracer_exp.training.trainer import Trainer
 
 from .command import read_metrics, read_summary
 
-_RAMP_S = 40.0
+_RAMP_S = 15.0
 """Seconds over which the workers of a load start."""
 _OF_A_RUN = threading.local()
 """What a worker's thread knows: whether it is asked to end, how long its first trial is, when a transaction began."""
