@@ -21,8 +21,8 @@ def costs(address: str, tracking: str, times: int, folder: Path) -> dict[str, di
     """Return the processor time in ms that PostgreSQL and MLflow, with its database, take for a call of each kind."""
     study, storage = f"costs-{uuid.uuid4().hex[:8]}", open_storage(address, folder)
     claims = TrialClaims(storage.engine, study)
-    held = {claims.claim(f"bench:{n}:a", 100, 3600.0): n for n in range(100)}
-    (one, *_), progress = held, {"iteration": 1, "params": {"algorithm.lr": 1e-3}}
+    held = [claims.claim(f"bench:{n}:a", 100, 3600.0) for n in range(100)]
+    one, progress = held[0], {"iteration": 1, "params": {"algorithm.lr": 1e-3}}
     assert one is not None
     options = resolve_database(address, folder).engine_options()
     own = TrialClaims(

@@ -11,7 +11,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-IDLE_S = 5.0
+IDLE_S = 2.0
 """Seconds without use after which connections are closed."""
 _OLDEST_S = 300
 """Age of a connection at which the next transaction opens another one. One that was open while its machine slept may
@@ -21,8 +21,8 @@ POOL: dict[str, Any] = {
     # A broken connection, as after a restart of the server, is replaced before it is used.
     "pool_pre_ping": True,
     "pool_recycle": _OLDEST_S,
-    # One for the trials and one for what runs beside them; more are closed at once.
-    "pool_size": 2,
+    # What a worker needs; more are closed when they are returned.
+    "pool_size": 1,
     "max_overflow": 8,
     "pool_use_lifo": True,
 }
