@@ -8,7 +8,7 @@ from types import FrameType
 
 from deepracer_exp.rewards.guard import CtrlC
 
-PATIENCE_S = 6.0
+PATIENCE_S = 4.0
 """Seconds after a signal at which an iteration that can be left out is; to end the workers takes some more."""
 _LOOK_EVERY_S = 0.1
 
