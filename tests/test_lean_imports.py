@@ -62,28 +62,33 @@ def _of_bits(row: dict) -> dict:
     return {key: value for key, value in row.items() if key not in MEASURED_BY_CLOCK}
 
 
-@pytest.mark.parametrize("first", ["tensordict.nn", "torchrl.checkpoint"])
-def test_any_part_of_torchrl_may_be_imported_first(first):
+@pytest.fixture(scope="module")
+def prepared() -> tuple[list[str], bool, bool, int]:
+    """What a process has loaded that began with the checkpoints of TorchRL and then prepared to be forked."""
     code = f"""
-import sys
+import gc, json, sys
 from deepracer_exp.lean_imports import import_lean
 import_lean()
-import {first}
-print([name for name in {UNUSED!r} if name in sys.modules], "torchrl.collectors" in sys.modules)
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "[] True"
-
-
-def test_the_fork_server_has_loaded_the_compiled_functions_of_its_workers():
-    code = """
-import gc
+import torchrl.checkpoint
+unused = [name for name in {UNUSED!r} if name in sys.modules]
+collects = "torchrl.collectors" in sys.modules
 import deepracer_exp.collectors.fork_ready
 from deepracer_exp.tracks import segments
-print(bool(segments._candidates.signatures), gc.get_freeze_count() > 0)
+print(json.dumps([unused, collects, bool(segments._candidates.signatures), gc.get_freeze_count()]))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["True", "True"]
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def test_any_part_of_torchrl_may_be_imported_first(prepared):
+    unused, collects, *_ = prepared
+    assert (unused, collects) == ([], True)
+
+
+def test_the_fork_server_has_loaded_the_compiled_functions_of_its_workers(prepared):
+    *_, has_compiled, frozen = prepared
+    assert has_compiled
+    assert frozen > 0
 
 
 def test_a_sweep_starts_its_workers_before_it_imports_pytorch(tmp_path):
