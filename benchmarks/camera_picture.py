@@ -1,4 +1,4 @@
-"""The picture of docs/camera.md: tracks as the camera sees them, and episodes that differ by randomization.
+"""The picture of docs/camera.md: tracks and rooms as the camera sees them, and episodes that differ by randomization.
 
 python -m benchmarks.camera_picture
 """
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.rooms import ROOMS
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.setup import build_setup
 
@@ -25,8 +26,8 @@ TRACKS = (
     "Bowtie_track",
     "Monaco",
 )
-STRAIGHT, STEPS = 7, 6
-"""Action of the default space, and steps until the picture is taken."""
+STEPS = 6
+"""Steps straight ahead until the picture is taken."""
 GAP = 4
 
 
@@ -36,9 +37,11 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=OUTPUT)
     output = parser.parse_args().output
     # The first car is a little before the start line.
-    tracks = look(f"track=[{','.join(TRACKS)}]", "episode.start_offset=0.965")
+    begin = "episode.start_offset=0.965"
+    tracks = look(f"track=[{','.join(TRACKS)}]", begin)
+    rooms = np.concatenate([look(f"track.floor={room}", begin)[:1] for room in ROOMS])
     episodes = look("randomization=sim2real")
-    rows = [beside(pictures) for pictures in (tracks[:4], tracks[4:], episodes[:4], episodes[4:])]
+    rows = [beside(pictures) for pictures in (tracks[:4], tracks[4:], rooms, episodes[:4], episodes[4:])]
     width = rows[0].shape[1]
     Image.fromarray(np.vstack(rows)[GAP:, GAP:]).quantize(128).save(output, optimize=True)
     print(f"{output}: {width} pixels wide, {output.stat().st_size / 1e3:.0f} kB")
@@ -52,7 +55,7 @@ def look(*overrides: str) -> NDArray[np.uint8]:
     race = Race(setup, len(TRACKS))
     race.reset()
     for _ in range(STEPS):
-        race.step(np.full(len(TRACKS), STRAIGHT))
+        race.step(np.zeros((len(TRACKS), 2)))
     return np.moveaxis(race.pixels, 1, -1)
 
 
