@@ -119,7 +119,7 @@ class _CompilerPlaceholder(ModuleType):
 
     @staticmethod
     def disable(function: Any = None, recursive: bool = True, **options: Any) -> Any:
-        return function if function is not None else lambda given: given
+        return function if function is not None else lambda decorated: decorated
 
     def remove(self) -> None:
         """Let the next import load the real compiler."""

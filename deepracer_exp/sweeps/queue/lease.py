@@ -180,8 +180,8 @@ class LeaseKeeper:
 
     def renew(self) -> None:
         """Renew, by one statement, the leases of the workers that have given a sign of life, and answer them."""
-        heard = [(worker, worker.hear()) for worker in self._workers()]
-        beats = [(worker, beat) for worker, beat in heard if beat is not None]
+        newest = [(worker, worker.hear()) for worker in self._workers()]
+        beats = [(worker, beat) for worker, beat in newest if beat is not None]
         if not beats:
             return
         try:

@@ -91,7 +91,7 @@ class RayWorker:
     def __init__(self, actor: Any, begun: Any):
         self._actor, self._begun = actor, begun
         self._ended: Any = None
-        self._heard: Any = None
+        self._coming_beat: Any = None
         """The answer of the actor that is under way: a sign of life of the worker, or None."""
         self._exitcode: int | None = None
         self.owner: str | None = None
@@ -115,16 +115,16 @@ class RayWorker:
         if self._ended is None or self._exitcode is not None:
             return None
         with contextlib.suppress(ray.exceptions.RayError):  # whose process is gone, is noticed elsewhere
-            if self._heard is None:
-                self._heard = self._actor.hear.remote(None)
-            if ray.wait([self._heard], timeout=0.0)[0]:
-                heard, self._heard = self._heard, None
-                return cast("Beat | None", ray.get(heard))
+            if self._coming_beat is None:
+                self._coming_beat = self._actor.hear.remote(None)
+            if ray.wait([self._coming_beat], timeout=0.0)[0]:
+                beat, self._coming_beat = self._coming_beat, None
+                return cast("Beat | None", ray.get(beat))
         return None
 
     def answer(self, answer: Answer) -> None:
         """Send an answer to the last sign of life on its way."""
-        self._heard = self._actor.hear.remote(answer)
+        self._coming_beat = self._actor.hear.remote(answer)
 
     def terminate(self) -> None:
         """Ask it to end; one that still waits for room ends at once."""
