@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 
-from deepracer_exp.runs.files import CONFIG, HEARTBEAT
+from deepracer_exp.runs.files import CONFIG, HEARTBEAT, METRICS
 
 from .report import benchmark_parser, number, table, write_json
 
@@ -110,7 +110,12 @@ def run(
 
 
 def has_stepped(folder: Path) -> bool:
-    """Return whether a worker of a training there has made a control step, by the file in which they count them."""
+    """Return whether a worker of a training there has made a control step, by the file in which they count them.
+
+    On a machine too busy to look in time, the first iteration's row says so later.
+    """
+    if any(folder.glob(f"runs/*/*/{METRICS}")):
+        return True
     for file in folder.glob(f"runs/*/*/{HEARTBEAT}"):
         try:
             steps = np.fromfile(file, np.int64)

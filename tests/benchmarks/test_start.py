@@ -33,6 +33,10 @@ def test_a_training_has_begun_to_drive_once_a_worker_has_counted_a_step(tmp_path
     for steps, driven in (([-1, -1], False), ([0, 0], False), ([0, 1], True)):
         np.array(steps, np.int64).tofile(run / ".heartbeat")
         assert has_stepped(tmp_path) == driven
+    (run / ".heartbeat").unlink()
+    assert not has_stepped(tmp_path)
+    (run / "metrics.jsonl").touch()
+    assert has_stepped(tmp_path)
     assert not has_trial(tmp_path)
     (run / "config.yaml").touch()
     assert has_trial(tmp_path)
@@ -42,4 +46,5 @@ def test_a_ratio_comes_with_an_interval_that_holds_it():
     of_same = ratio([2.0, 2.0, 2.0], [1.0, 1.0, 1.0])
     assert of_same == {"ratio": 0.5, "low": 0.5, "high": 0.5}
     uneven = ratio([4.0, 5.0, 6.0], [2.0, 4.0, 3.0])
-    assert uneven["low"] < uneven["ratio"] == pytest.approx(0.6) < uneven["high"]
+    assert uneven["ratio"] == pytest.approx(0.6)
+    assert uneven["low"] < uneven["ratio"] < uneven["high"]
