@@ -341,6 +341,7 @@ def read_trace(folder: Path, columns: Sequence[str] = TRACE_COLUMNS) -> "pd.Data
             reason = " ".join(str(error).split())
             raise BadInput(path, f"not a trace ({reason})", "a complete Parquet file of a run") from error
     for name, values in read.items():
-        if SCHEMA.field(name).type == pa.float32():
-            read[name] = values.astype(np.float32, copy=False)
+        kind = SCHEMA.field(name).type
+        if pa.types.is_floating(kind):
+            read[name] = values.astype(kind.to_pandas_dtype(), copy=False)
     return pd.DataFrame(read, copy=False)
