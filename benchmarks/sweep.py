@@ -27,7 +27,7 @@ on `sweep.rerank_laps` more laps. For the sweep itself this must be the winner t
 - `best`: its trial, its value (the race score in seconds) in the sweep and on the re-ranking's laps, and its laps;
 - `rivals`: the same of `no_pruning`, `median` and `hyperband`.
 
-`--reuse DIR` leaves everything in DIR (35 MB a trial, mostly traces), resumes a sweep that was interrupted and reuses
+`--reuse DIR` leaves everything in DIR (11 MB a trial, mostly traces), resumes a sweep that was interrupted and reuses
 the finished runs in it. `minutes` is then the time of all starts of the sweep; `starts` counts them.
 """
 
