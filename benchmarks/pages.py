@@ -6,7 +6,7 @@
   process that has imported what a training has; what they import themselves is counted;
 - `study_s`: `deepracer-exp sweep report NAME` in the working directory, with `--study` only;
 - `analyze_s`: `deepracer-exp analyze` of a text log of so many megabytes, from the start of the process to its end. It
-  repeats the longest log of `--log`, with episodes and times that go on.
+  repeats the longest log of `--log`, with increasing episodes and times.
 
 Each is the best of `--turns` processes, because what others do on the machine only ever adds to it. CPU seconds, of all
 threads, of user and system, do not depend on how many others wait for a core. Without `--run` a training of a million

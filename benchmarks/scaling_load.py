@@ -84,7 +84,7 @@ class Template:
 
     folder: Path
     iterations: int
-    """Of each simulated training."""
+    """Iterations of each simulated training."""
     every: int
     """Iterations between two checkpoints, each with an evaluation."""
 
@@ -144,7 +144,7 @@ class SimulatedTrial(TrialRun):
         return TrainResult(Ending.by_budget("iterations"), 0, folder, summary)
 
     def _resumed(self, run: SeedRun) -> TrainResult | None:
-        return None  # begun anew, in another folder
+        return None  # begun again, in another folder
 
     def _evaluated(self, folder: Path) -> dict[str, Any]:
         self._lease.confirm()
@@ -153,7 +153,7 @@ class SimulatedTrial(TrialRun):
 
 
 def _link(source: Path, target: Path, *, only_files: bool = False) -> None:
-    """Give a run the files of another, which stay as they are; its metrics begin anew."""
+    """Give a run the files of another, which stay as they are; its metrics begin again."""
     target.mkdir(parents=True, exist_ok=True)
     for path in source.iterdir():
         if path.is_file() and path.name not in (METRICS, SUMMARY, TRACKING):

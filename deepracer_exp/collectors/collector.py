@@ -30,7 +30,7 @@ from .watchdog import Watchdog
 from .worker import CarCollector, EnvFactory
 
 _LOOK_EVERY_S = 0.2
-_LAST_BATCH_S = 1.0  # for which a batch that nobody will read is waited for, before its workers are killed
+_LAST_BATCH_S = 1.0  # wait at the end for a batch under way, which is not used, before its workers are killed
 _CHUNK_STEPS = 32  # control steps of each car between two counts of the episodes that have ended
 
 _T = TypeVar("_T")
@@ -102,7 +102,7 @@ class LocalCollector(Collector):
         self.close()
 
     def begin_next(self) -> None:
-        """Let the workers drive the next batch meanwhile; in this process nothing begins."""
+        """Let the workers begin the next batch; cars of this process wait until it is asked for."""
         if self._watchdog is not None:
             self._states = self._worker_states()
             self._begun_at_s = time.monotonic()

@@ -69,7 +69,7 @@ class MLflowRun:
     def open(self, tracked: TrackedRun, *, is_first: bool = False) -> None:
         """Create the run, or continue it if the store has it already, with or without an answer that said so.
 
-        `is_first`: nobody has tried to create it before.
+        `is_first`: there was no attempt to create it before.
         """
         self.run_id = tracked.run_id
         with store_errors():

@@ -60,7 +60,7 @@ class MLflowProjection:
     """
 
     def __init__(self, store: Store, file: TrackingFile, *, is_new: bool = False) -> None:
-        """Project the folder of a tracking.json to a store; `is_new`: nobody has tried to create the run there."""
+        """Project the folder of a tracking.json to a store; `is_new`: there was no attempt to create the run there."""
         self.beside: list[Point] = []
         self.written = 0
         self._store, self._file, self._folder = store, file, file.folder
