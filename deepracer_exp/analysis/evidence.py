@@ -13,9 +13,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from .statistics import CONFIDENCE, Values
-
+Values = NDArray[np.float64]
+CONFIDENCE = 0.95
 RESAMPLES = 2000
 LEAST_FOR_INTERVAL = 3
 """Seeds of a group below which it has no interval."""

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 Values = NDArray[np.float64]
 MOST_ROWS = 100_000
 """Rows beyond which quantiles and the width of bins are those of an evenly spaced part of them."""
-CONFIDENCE = 0.95
 
 
 def moving_average(values: Values) -> Values:

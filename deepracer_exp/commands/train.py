@@ -275,8 +275,9 @@ def _sweep(args: argparse.Namespace) -> int:
 
     from rich.console import Console
 
+    from deepracer_exp.sweeps import PAGE_FILE
     from deepracer_exp.sweeps.report.best import complete_trials
-    from deepracer_exp.sweeps.sweep import REPORT, sweep
+    from deepracer_exp.sweeps.sweep import sweep
 
     with warnings_on_stderr():
         study, folder, code = sweep(plan, Console(stderr=True))
@@ -289,7 +290,7 @@ def _sweep(args: argparse.Namespace) -> int:
         _print_best(study)
     else:
         print("no trial was completed: all were pruned or failed")
-    print(f"\n  page  {folder / REPORT}")
+    print(f"\n  page  {folder / PAGE_FILE}")
     print_unsent(folder)
     return 0
 
@@ -302,7 +303,7 @@ def _show_study(word: str, *arguments: str) -> int:
         raise BadInput(f"sweep {word}: accepted: one study, as in `deepracer-exp sweep {word} lr_entropy`")
 
     from deepracer_exp.config.experiment import safe_name
-    from deepracer_exp.sweeps import DEFAULT_FILE
+    from deepracer_exp.sweeps import DEFAULT_FILE, PAGE_FILE
 
     with reading(f"sweep {word} {names[0]}"):
         safe_name(names[0])
@@ -319,9 +320,8 @@ def _show_study(word: str, *arguments: str) -> int:
         return 0
 
     from deepracer_exp.sweeps.report.page import write_study_page
-    from deepracer_exp.sweeps.sweep import REPORT
 
-    print(write_study_page(study, runs_dir / study.study_name / REPORT))
+    print(write_study_page(study, runs_dir / study.study_name / PAGE_FILE))
     return 0
 
 

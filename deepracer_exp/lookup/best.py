@@ -9,7 +9,6 @@ from typing import Annotated, Any
 from pydantic import Field, TypeAdapter
 
 from deepracer_exp.config.experiment import safe_name
-from deepracer_exp.config.stored import config_differences
 from deepracer_exp.errors import BadInput, nearest
 from deepracer_exp.files import atomic_write, read_json_as
 from deepracer_exp.runs.files import (
@@ -121,6 +120,9 @@ def _check_comparable(what: str, results: Mapping[Path, RunResult]) -> None:
             if mine == other:
                 continue
             if _short(mine) == _short(other):  # of one name
+                # Imported here: it takes Hydra, which no page needs.
+                from deepracer_exp.config.stored import config_differences
+
                 key, (mine, other) = next(iter(config_differences([{key: mine}, {key: other}]).items()))
             raise BadInput(
                 what,

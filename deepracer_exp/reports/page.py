@@ -8,17 +8,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from typing import Any
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import jinja2
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
-from plotly.offline import get_plotlyjs
 
-from deepracer_exp.analysis.charts.figure import Chart
-from deepracer_exp.analysis.charts.layout import Figure, draw
-from deepracer_exp.analysis.charts.style import DARK, NARROW_WIDTH
+from deepracer_exp.analysis.charts.style import DARK, NARROW_WIDTH, Figure
+
+if TYPE_CHECKING:
+    from deepracer_exp.analysis.charts.figure import Chart
 
 
 @dataclass(frozen=True)
@@ -79,15 +81,22 @@ def _array(values: NDArray[np.float32]) -> dict[str, str] | list[float]:
     return {"dtype": "f4", "bdata": data, "shape": ",".join(map(str, values.shape))}
 
 
-def plot_of(chart: Chart) -> Plot:
+def plot_of(chart: "Chart") -> Plot:
     """Draw a chart for desk and phone, and pack it."""
+    # Imported here: a chart needs pandas, and the figures of a sweep are no charts.
+    from deepracer_exp.analysis.charts.layout import draw
+
     return plot(draw(chart), chart.name, chart.title, draw(chart, NARROW_WIDTH))
 
 
 def gzip_base64(text: str) -> str:
     """Return a text as gzip in base64, the same for the same text."""
+    return _gzip_base64(text.encode())
+
+
+def _gzip_base64(text: bytes) -> str:
     # Half the time of the usual level, for a page that is three per cent larger.
-    return base64.b64encode(gzip.compress(text.encode(), 4, mtime=0)).decode("ascii")
+    return base64.b64encode(gzip.compress(text, 4, mtime=0)).decode("ascii")
 
 
 def render(
@@ -124,7 +133,7 @@ def render(
     sources = [(__package__, "page.js"), *((package, name) for name in scripts)]
     texts = [(files(place) / name).read_text(encoding="utf-8") for place, name in sources]
     return environment.get_template(template).render(
-        policy=_policy(*texts, get_plotlyjs()) + ("; connect-src 'self'" if is_live else ""),
+        policy=_policy(*map(str.encode, texts), _plotly()) + ("; connect-src 'self'" if is_live else ""),
         contents=[],
         plots=plots,
         dark=Markup(json.dumps(DARK)),  # our own colours
@@ -134,12 +143,12 @@ def render(
     )
 
 
-def _policy(*scripts: str) -> str:
+def _policy(*scripts: bytes) -> str:
     """Return the content security policy: these scripts only, and no network.
 
     Plotly compiles functions from text to draw with WebGL.
     """
-    digests = (base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts)
+    digests = (base64.b64encode(hashlib.sha256(script).digest()).decode() for script in scripts)
     hashes = " ".join(f"'sha256-{digest}'" for digest in digests)
     return (
         f"default-src 'none'; script-src {hashes} 'unsafe-eval'; style-src 'unsafe-inline'; img-src data: blob:; "
@@ -148,5 +157,14 @@ def _policy(*scripts: str) -> str:
 
 
 @cache
+def _plotly() -> bytes:
+    """Return plotly.js as its Python package holds it, without the time of that package's import."""
+    spec = find_spec("plotly")
+    assert spec is not None
+    assert spec.origin is not None
+    return (Path(spec.origin).parent / "package_data" / "plotly.min.js").read_bytes()
+
+
+@cache
 def _packed_plotly() -> str:
-    return gzip_base64(get_plotlyjs())
+    return _gzip_base64(_plotly())

@@ -33,6 +33,7 @@ from deepracer_exp.tracking.study_run import Progress, StudyRun
 from deepracer_exp.tracking.tracking_file import Status
 from deepracer_exp.training.signals import Interruption
 
+from . import PAGE_FILE
 from .plan import SweepPlan
 from .queue.claims import Claim, TrialClaims, report_results
 from .queue.driver import Driver
@@ -64,8 +65,6 @@ _log = logging.getLogger("deepracer_exp")
 
 _DONE_S, _INTERRUPTED_S = 30.0, 2.0
 """How long to wait for MLflow when a sweep is done, and when it was interrupted and can resume."""
-REPORT = "sweep.html"
-"""A study's page, in the folder of its runs."""
 _FRESH_SEED = 30_011
 """Seed of the conditions of fresh laps; no protocol of the project has it."""
 _FRESH_SHIFT = 0.25
@@ -181,7 +180,7 @@ def _run(
             return interruption.exit_code
         track(patiently(claims.all, patience_s))
     if study_run is not None:
-        study_run.log_report(worker_config.folder / REPORT)
+        study_run.log_report(worker_config.folder / PAGE_FILE)
     return 0
 
 
@@ -244,7 +243,7 @@ def _conclude(
         study.set_user_attr("reranked", [])
     if complete_trials(study):
         write_best(study, worker_config.runs_dir)
-    write_study_page(study, worker_config.folder / REPORT)
+    write_study_page(study, worker_config.folder / PAGE_FILE)
 
 
 def _without_rules(request: SweepRequest, overrides: Sequence[str]) -> SweepRequest:

@@ -1,11 +1,16 @@
 import itertools
 import random
+import subprocess
+import sys
 
 import numpy as np
+import plotly.graph_objects as go
 import pytest
 from optuna.distributions import CategoricalDistribution
+from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
 
-from deepracer_exp.sweeps.report.figures import FEWEST_COMPLETE, figures, narrowed, thinned
+from deepracer_exp.sweeps.report.figure_layout import narrowed
+from deepracer_exp.sweeps.report.figures import FEWEST_COMPLETE, figures, thinned
 from deepracer_exp.sweeps.report.labels import ENDINGS, ending_of, short_keys
 
 from .studies import DISTRIBUTIONS, add, new_study
@@ -19,30 +24,75 @@ def drawn(study):
 def curves(figure):
     """Return the points of an entropy figure by outcome and trial."""
     found = {}
-    for trace in figure.data:
-        for step, value, trial in zip(trace.x, trace.y, trace.customdata, strict=True):
+    for trace in figure["data"]:
+        for step, value, trial in zip(trace["x"], trace["y"], trace["customdata"], strict=True):
             if step is not None:
-                found.setdefault((trace.name, trial), []).append((step, value))
+                found.setdefault((trace["name"], trial), []).append((step, value))
     return found
 
 
 def test_all_figures_have_one_style_and_a_layout_for_a_narrow_screen(drawn):
     assert list(drawn) == ["history", "importance", "slice", "parallel", "entropy"]
     for figure in drawn.values():
-        narrow = narrowed(figure)
-        assert figure.layout.font.family == narrow.layout.font.family == "system-ui, sans-serif"
-        assert figure.layout.title.text.startswith("<b>")
-        assert narrow.layout.height > 100
-    ends = [axis.domain for axis in narrowed(drawn["slice"]).select_yaxes()]
+        desk, narrow = figure["layout"], narrowed(figure)["layout"]
+        assert desk["font"]["family"] == narrow["font"]["family"] == "system-ui, sans-serif"
+        assert desk["title"]["text"].startswith("<b>")
+        assert narrow["height"] > 100
+        # Plotly's own objects refuse what plotly.js does not know.
+        assert [len(go.Figure(data=figure["data"], layout=layout).data) for layout in (desk, narrow)]
+    phone = narrowed(drawn["slice"])["layout"]
+    ends = [axis["domain"] for name, axis in phone.items() if name.startswith("yaxis")]
+    assert len(ends) > 2
     assert all(above[0] > below[1] for above, below in itertools.pairwise(ends))
 
 
 def test_the_history_has_every_complete_trial_and_the_decisive_parameter_is_the_most_important(study, drawn):
-    numbers = {number for trace in drawn["history"].data if trace.mode == "markers" for number in trace.x}
-    assert numbers == {trial.number for trial in study.trials if trial.state.name == "COMPLETE"}
-    (bars,) = drawn["importance"].data
-    assert bars.y[-1] == "lr"
-    assert sum(bars.x) == pytest.approx(1, abs=0.001)
+    complete = [trial for trial in study.trials if trial.state.name == "COMPLETE"]
+    dots, so_far = drawn["history"]["data"]
+    assert dots["x"] == [trial.number for trial in complete]
+    assert so_far["y"][:-1] == [min(dots["y"][: made + 1]) for made in range(len(complete))]
+    assert so_far["x"][-1] == study.trials[-1].number
+    (bars,) = drawn["importance"]["data"]
+    assert bars["y"][-1] == "lr"
+    assert sum(bars["x"]) == pytest.approx(1, abs=0.001)
+
+
+def test_the_importance_is_that_of_optuna(study, drawn):
+    keys = short_keys({key for trial in study.trials for key in trial.params})
+    evaluator = PedAnovaImportanceEvaluator(target_quantile=0.25)
+    optunas = get_param_importances(study, evaluator=evaluator)
+    (bars,) = drawn["importance"]["data"]
+    assert dict(zip(bars["y"], bars["x"], strict=True)) == {
+        keys[key]: value for key, value in optunas.items()
+    }
+
+
+def test_every_complete_trial_is_a_point_of_each_slice_it_has(study, drawn):
+    complete = [trial for trial in study.trials if trial.state.name == "COMPLETE"]
+    figure = drawn["slice"]
+    names = [figure["layout"][f"xaxis{trace['xaxis'][1:]}"]["title"]["text"] for trace in figure["data"]]
+    assert names == ["entropy_coeff", "lr", "hidden", "reward"]
+    for key, trace in zip(sorted(DISTRIBUTIONS), figure["data"], strict=True):
+        some = [trial for trial in complete if key in trial.params]
+        assert trace["y"] == [trial.value for trial in some]
+        assert trace["marker"]["color"] == [trial.number for trial in some]
+
+
+def test_a_page_of_a_study_takes_none_of_the_packages_that_take_seconds_to_import(tmp_path):
+    code = """
+import sys
+from pathlib import Path
+from deepracer_exp.sweeps.report.page import study_page
+from tests.sweeps.studies import add, new_study
+study = new_study(Path(sys.argv[1]))
+for made in range(24):
+    add(study, [8.0 + made], params={"algorithm.lr": 10 ** (-5 + made / 12), "algorithm.entropy_coeff": made / 999})
+assert 'id="data-importance"' in study_page(study)
+print(*sorted({name.partition(".")[0] for name in sys.modules}))
+"""
+    line = [sys.executable, "-c", code, str(tmp_path)]
+    imported = set(subprocess.run(line, check=True, capture_output=True, text=True).stdout.split())
+    assert not imported & {"sklearn", "matplotlib", "plotly", "scipy", "pandas"}
 
 
 @pytest.mark.parametrize(
@@ -56,7 +106,7 @@ def test_a_few_failures_take_no_room_from_the_others(tmp_path, objective, usual,
     study = new_study(tmp_path, objectives=[objective])
     for value in (*usual[:3], *failed, *usual[3:]):
         add(study, [value])
-    low, high = figures(study)["history"].layout.yaxis.range
+    low, high = figures(study)["history"]["layout"]["yaxis"]["range"]
     assert (max(usual) - min(usual)) / (high - low) > 0.6
     assert low < min(usual) < max(usual) < high
 
@@ -75,8 +125,9 @@ def test_several_objectives_have_a_figure_each_and_a_pareto_front(tmp_path):
     kinds = ("history", "importance", "slice")
     of_each = {f"{kind}-{name}" for kind in kinds for name in ("lap_time", "completion")}
     assert set(found) == of_each | {"pareto", "parallel"}
-    drawn = {(x, y) for trace in found["pareto"].data for x, y in zip(trace.x, trace.y, strict=True)}
-    assert drawn == {tuple(trial.values) for trial in study.trials}
+    others, front = ([*zip(trace["x"], trace["y"], strict=True)] for trace in found["pareto"]["data"])
+    assert front == [tuple(trial.values) for trial in study.trials if trial in study.best_trials]
+    assert {*others, *front} == {tuple(trial.values) for trial in study.trials}
 
 
 def test_the_entropy_of_each_run_is_drawn_under_its_outcome_up_to_its_end(study, drawn):
@@ -112,8 +163,8 @@ def test_the_share_of_entropy_is_drawn_where_the_rows_have_it(tmp_path):
     file = tmp_path / "lr_entropy" / "run-0" / "metrics.jsonl"
     file.write_text('{"env_steps": 10, "entropy": 2.5, "entropy_share": 0.8}\n')
     figure = figures(study)["entropy"]
-    assert figure.data[0].y[0] == 0.8
-    assert "share" in figure.layout.yaxis.title.text
+    assert figure["data"][0]["y"][0] == 0.8
+    assert "share" in figure["layout"]["yaxis"]["title"]["text"]
 
 
 def test_thinning_keeps_both_ends_and_the_order():
@@ -123,10 +174,13 @@ def test_thinning_keeps_both_ends_and_the_order():
 
 
 def test_a_trial_without_a_parameter_is_at_the_dash_of_its_parallel_axis(study, drawn):
-    (axis,) = (axis for axis in drawn["parallel"].data[0].dimensions if axis.label == "hidden")
+    (lines,) = drawn["parallel"]["data"]
+    (axis,) = (axis for axis in lines["dimensions"] if axis["label"] == "hidden")
     complete = [trial for trial in study.trials if trial.state.name == "COMPLETE"]
-    assert axis.ticktext == ("–", "[64,64]", "[256,256]")  # noqa: RUF001
-    assert [value == 0 for value in axis.values] == ["network.hidden" not in one.params for one in complete]
+    assert axis["ticktext"] == ["–", "[64,64]", "[256,256]"]  # noqa: RUF001
+    assert [value == 0 for value in axis["values"]] == [
+        "network.hidden" not in one.params for one in complete
+    ]
 
 
 def test_an_empty_study_and_one_that_just_begins_have_no_figures(tmp_path):
@@ -192,14 +246,14 @@ def test_no_two_labels_below_a_panel_meet(tmp_path, choices):
         params = {"action_space": names[number % choices], "algorithm.lr": 10 ** (-5 + number / 12)}
         add(study, [8.0 + number], params=params, distributions=kinds)
     drawn = figures(study)["slice"]
-    for layout, width in ((drawn.layout, 260), (narrowed(drawn).layout, 160)):
-        (axis,) = (one for one in (layout.xaxis, layout.xaxis2) if one.type == "category")
-        lines = [line for text in axis.ticktext for line in text.split("<br>")]
-        assert len(axis.ticktext) == choices
-        if axis.tickangle == -90:
+    for layout, width in ((drawn["layout"], 260), (narrowed(drawn)["layout"], 160)):
+        axis, powers = layout["xaxis"], layout["xaxis2"]
+        assert (axis["type"], powers["type"]) == ("category", "log")
+        lines = [line for text in axis["ticktext"] for line in text.split("<br>")]
+        assert len(axis["ticktext"]) == choices
+        if axis["tickangle"] == -90:
             assert 13 * choices <= width
             assert max(map(len, lines)) <= 16
         else:
             assert max(map(len, lines)) * 6.3 <= width / choices
-        (axis,) = (one for one in (layout.xaxis, layout.xaxis2) if one.type == "log")
-        assert 2 <= len(axis.tickvals) <= 4
+        assert 2 <= len(powers["tickvals"]) <= 4

@@ -5,21 +5,17 @@ import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
 from .figure import Annotation, Chart, Layer, Panel, Trace
-from .style import FAINT, GRID, INK, SPINE, WIDTH, base_layout, escaped
+from .style import FAINT, GRID, INK, SPINE, WIDTH, Figure, base_layout, escaped
 
 # All in pixels. Letters have mean widths: 9 in a panel's title, 7 in legends and names.
 _LEFT, _RIGHT, _COLOR_BAR = 74.0, 14.0, 86.0
 """Room beside the axes of a panel: for its numbers to the left, free to the right, and for a colour bar there."""
 _LEGEND_ROW, _TITLE_ROW = 21.0, 24.0
-
-
-Figure: TypeAlias = dict[str, Any]
-"""`data`, the traces, and `layout`, as plotly.js reads them; numbers of traces are arrays."""
 
 
 def draw(chart: Chart, width: float = WIDTH) -> Figure:

@@ -2,7 +2,7 @@
 
 import html
 import textwrap
-from typing import Any
+from typing import Any, TypeAlias
 
 BLUE, ORANGE, GREEN, VERMILION = "#0072b2", "#e69f00", "#009e73", "#d55e00"
 PURPLE, SKY, YELLOW, BLACK = "#cc79a7", "#56b4e9", "#f0e442", "#000000"
@@ -52,6 +52,8 @@ DARK = {
 """Replacements for the colours of a figure on a dark page; all others can be seen on both."""
 WIDTH, NARROW_WIDTH = 1040.0, 400.0
 """Pixels for which figures are laid out, on a desk and on a phone."""
+Figure: TypeAlias = dict[str, Any]
+"""`data`, the traces, and `layout`, as plotly.js reads them; numbers of traces are arrays or lists."""
 _TITLE_LETTER = 11.3
 """Mean width of a letter of the title, pixels."""
 

@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import optuna
 from optuna.exceptions import ExperimentalWarning
@@ -11,16 +12,18 @@ from optuna.storages import RDBStorage
 from optuna.study import Study, StudyDirection
 
 from deepracer_exp.addresses import redact
-from deepracer_exp.config.overrides import group_of, key_of
-from deepracer_exp.config.sweep import SweepRequest, compose_sweep
 from deepracer_exp.errors import BadInput, nearest
 from deepracer_exp.sweeps import DEFAULT_FILE
 from deepracer_exp.sweeps.search.objectives import MEASURES
-from deepracer_exp.sweeps.search.space import SearchSpace
 
 from .claims import TABLE
 from .storage import open_storage
-from .worker_config import Parent
+
+if TYPE_CHECKING:  # to find a study needs nothing of what composes one
+    from deepracer_exp.config.sweep import SweepRequest
+    from deepracer_exp.sweeps.search.space import SearchSpace
+
+    from .worker_config import Parent
 
 MAY_DIFFER = (
     *("study", "debug", "sweep/executor", "sweep.trials", "sweep.workers", "sweep.storage", "sweep.lease_s"),
@@ -63,8 +66,8 @@ def load_study(name: str, storage: RDBStorage) -> Study:
 
 
 def with_stored(
-    request: SweepRequest, overrides: Sequence[str]
-) -> tuple[Sequence[str], SweepRequest, Study | None]:
+    request: "SweepRequest", overrides: Sequence[str]
+) -> tuple[Sequence[str], "SweepRequest", Study | None]:
     """Return the overrides of a sweep, the request they make, and its study if that exists.
 
     Overrides that only name a study are preceded by those that the study was begun with, and composed with them.
@@ -72,6 +75,9 @@ def with_stored(
     Raises:
         BadInput: an override is not accepted, there is nothing to search, or there is no study of that name to resume.
     """
+    from deepracer_exp.config.overrides import key_of
+    from deepracer_exp.config.sweep import compose_sweep
+
     names_only = not set(map(key_of, overrides)) - {*MAY_DIFFER}
     study = _existing(request, names_only)
     if study is None:
@@ -90,10 +96,10 @@ def with_stored(
 
 
 def open_study(
-    request: SweepRequest,
+    request: "SweepRequest",
     overrides: Sequence[str],
-    space: SearchSpace,
-    parent: Parent | None,
+    space: "SearchSpace",
+    parent: "Parent | None",
     storage: RDBStorage,
     runs_dir: Path,
 ) -> Study:
@@ -158,10 +164,12 @@ def _differences(stored: dict[str, object], wanted: dict[str, object]) -> list[s
 
 def _says_where(override: str) -> bool:
     """Return whether an override only says in which processes a trial's cars drive, which does not change the trial."""
+    from deepracer_exp.config.overrides import group_of, key_of
+
     return group_of(override) == "collector" and key_of(override) != "collector.cars"
 
 
-def _existing(request: SweepRequest, must_exist: bool) -> Study | None:
+def _existing(request: "SweepRequest", must_exist: bool) -> Study | None:
     """Return the study that the request names, if it exists; no file is created by looking."""
     if request.entry.study is None:
         return None

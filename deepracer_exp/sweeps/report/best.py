@@ -9,8 +9,7 @@ import numpy as np
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
-from deepracer_exp.analysis.evidence import difference, estimate
-from deepracer_exp.analysis.statistics import Values
+from deepracer_exp.analysis.evidence import Values, difference, estimate
 from deepracer_exp.errors import BadInput
 from deepracer_exp.lookup.best import BestOfSweep, write_best_of_sweep
 from deepracer_exp.runs.files import is_run

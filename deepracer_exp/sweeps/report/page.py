@@ -1,7 +1,6 @@
 """The HTML page of a study, which needs nothing beside it."""
 
 import base64
-import json
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,7 +27,8 @@ from deepracer_exp.sweeps.search.objectives import (
 from deepracer_exp.sweeps.trial import Trial
 
 from .best import best_line, best_run, best_shown, best_trial, complete_trials, over_seeds, reranked
-from .figures import FEWEST_COMPLETE, figures, least_width, narrowed
+from .figure_layout import least_width, narrowed
+from .figures import FEWEST_COMPLETE, figures
 from .labels import ENDINGS, duration, ending_of, ending_words, parameter, short_keys, steps
 
 _MOST_ROWS = 300
@@ -54,13 +54,7 @@ def study_page(study: optuna.Study) -> str:
     trials = study.get_trials(deepcopy=False)
     complete = complete_trials(study)
     plots = [
-        plot(
-            json.loads(figure.to_json()),
-            name,
-            figure.layout.meta["title"],
-            json.loads(narrowed(figure).to_json()),
-            least_width(figure),
-        )
+        plot(figure, name, figure["layout"]["meta"]["title"], narrowed(figure), least_width(figure))
         for name, figure in figures(study).items()
     ]
     keys = short_keys(sorted({key for trial in trials for key in trial.params}))
