@@ -177,7 +177,7 @@ def _importance(importances: Mapping[str, float], keys: Mapping[str, str], title
         "text": [f"{value:.2f}" if value >= 0.01 else "<0.01" for value in x],
         "hovertemplate": "%{y}: %{x:.0%}<extra></extra>",
     }
-    axes = {
+    axes: dict[str, Axis] = {
         # Room for the figures beside the bars.
         "xaxis": {"title": "importance", "tickformat": ".0%", "range": (0, 1.2 * max(x))},
         "yaxis": {"automargin": True, "ticksuffix": "  "},
