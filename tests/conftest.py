@@ -41,6 +41,10 @@ settings.load_profile("same")
 
 compose_once()
 
+# Where containers forbid it, every process would compile the tests and the package anew: ten seconds of each worker.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
 # A job that a script starts in the background ignores Ctrl-C, and so would the processes that the tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
