@@ -1,7 +1,7 @@
 """Recordings of drives that never were: their lap times, mistakes and curves are known by construction."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -83,18 +83,23 @@ def made_up_recording(
         evaluations: drives of other streams.
         name: of the recording.
     """
-    track, dice = made_up_course(course), np.random.default_rng(0)
+    dice = np.random.default_rng(0)
     everything = [("training", drives), *(evaluations or {}).items()]
-    speeds = sorted({speed for _, some in everything for one in some for speed in _speeds(one)})
+    speeds = tuple(sorted({speed for _, some in everything for one in some for speed in _speeds(one)}))
     tables = []
     for stream, some in everything:
         clock_s = 20.0
         for episode, drive in enumerate(some):
-            rows = _rows(track, drive, speeds, dice)
-            rows["tstamp"] += clock_s
-            clock_s = rows["tstamp"].iloc[-1] + 0.05
-            tables.append(rows.assign(stream=stream, episode=episode, track=course))
-    steps = pd.concat(tables, ignore_index=True)
+            same = replace(drive, iteration=0)
+            rows = _rows(course, same, speeds, dice) if drive.wanders else _drawn_once(course, same, speeds)
+            time_s = rows["tstamp"] + clock_s
+            clock_s = time_s[-1] + 0.05
+            of = {"stream": stream, "episode": episode, "iteration": drive.iteration}
+            tables.append(rows | {"tstamp": time_s} | {key: np.full(len(time_s), of[key]) for key in of})
+    steps = pd.DataFrame({key: np.concatenate([rows[key] for rows in tables]) for key in tables[0]})
+    steps = steps.assign(
+        worker=0, pause_duration=0.0, track=course, track_len=made_up_course(course).length_m
+    )
     for column in ("obstacle_crash_counter", "wall_clock", "speed_mps"):
         steps[column] = np.nan
     updates = pd.DataFrame(
@@ -119,7 +124,16 @@ def _speeds(drive: Drive) -> list[float]:
     return [drive.speed_mps, *(speed for _, _, speed in drive.sections)]
 
 
-def _rows(track: Track, drive: Drive, speeds: Sequence[float], dice: np.random.Generator) -> pd.DataFrame:
+@cache
+def _drawn_once(course: str, drive: Drive, speeds: tuple[float, ...]) -> dict[str, np.ndarray]:
+    """Return the rows of a drive that nothing is drawn by chance for: trainings repeat the same ones."""
+    return _rows(course, drive, speeds, np.random.default_rng())
+
+
+def _rows(
+    course: str, drive: Drive, speeds: tuple[float, ...], dice: np.random.Generator
+) -> dict[str, np.ndarray]:
+    track = made_up_course(course)
     passed_s = drive._passed_s(track.length_m)
     until = drive.until
     if drive.off_at is not None:
@@ -152,29 +166,23 @@ def _rows(track: Track, drive: Drive, speeds: Sequence[float], dice: np.random.G
     status[0] = "prepare"
     if complete or off:
         status[-1] = "lap_complete" if complete else "off_track"
-    return pd.DataFrame(
-        {
-            "worker": 0,
-            "iteration": drive.iteration,
-            "steps": np.arange(1, len(gone) + 1),
-            "X": xy[:, 0],
-            "Y": xy[:, 1],
-            "yaw": np.degrees((yaw_rad + np.pi) % (2 * np.pi) - np.pi),
-            "steer": steering,
-            "throttle": throttle,
-            "action": len(STEERING_DEG) * np.searchsorted(speeds, throttle)
-            + np.searchsorted(STEERING_DEG, steering),
-            "reward": np.diff(100.0 * gone, prepend=0.0),
-            "done": (np.arange(len(gone)) == len(gone) - 1) & (complete or off),
-            "all_wheels_on_track": np.abs(offset_m) < track.width_min_m / 2 - 0.1,
-            "progress": 100.0 * gone,
-            "closest_waypoint": np.where(near[0] <= near[1], found.previous, found.next),
-            "track_len": track.length_m,
-            "tstamp": time_s,
-            "episode_status": status,
-            "pause_duration": 0.0,
-        }
-    )
+    return {
+        "steps": np.arange(1, len(gone) + 1),
+        "X": xy[:, 0],
+        "Y": xy[:, 1],
+        "yaw": np.degrees((yaw_rad + np.pi) % (2 * np.pi) - np.pi),
+        "steer": steering,
+        "throttle": throttle,
+        "action": len(STEERING_DEG) * np.searchsorted(speeds, throttle)
+        + np.searchsorted(STEERING_DEG, steering),
+        "reward": np.diff(100.0 * gone, prepend=0.0),
+        "done": (np.arange(len(gone)) == len(gone) - 1) & (complete or off),
+        "all_wheels_on_track": np.abs(offset_m) < track.width_min_m / 2 - 0.1,
+        "progress": 100.0 * gone,
+        "closest_waypoint": np.where(near[0] <= near[1], found.previous, found.next),
+        "tstamp": time_s,
+        "episode_status": status,
+    }
 
 
 def _towed(xy: np.ndarray, yaw_rad: float) -> np.ndarray:
