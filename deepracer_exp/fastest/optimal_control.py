@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from deepracer_exp.sim.rollout import advance, linearise
-from deepracer_exp.tracks.segments import nearest_segment, on_road
+from deepracer_exp.tracks.segments import along, is_on_road, nearest_segment
 
 _BLUR_M = 0.005
 """Wheels whose distances to the border differ by less count both, so that the larger one has derivatives."""
@@ -19,7 +19,6 @@ _POSE = 3
 """The first entries of a state, on which the road depends."""
 _NUDGE = 1e-5
 _DAMP_SPEED, _DAMP_STEERING, _DAMP_ALONG, _DAMP_ACROSS, _DAMP_YAW = 0.01, 0.1, 0.05, 1.0, 0.1
-_ALONE = np.zeros(1, np.int64)
 
 
 @njit(cache=True)
@@ -35,12 +34,9 @@ def _inside_m(course, x_m, y_m):  # type: ignore[no-untyped-def]
     nearest = np.inf
     for border in (course.inner, course.outer):
         row, fraction = nearest_segment(border, 0, x_m, y_m)
-        x = border.x[row] + fraction * (border.x[row + 1] - border.x[row])
-        y = border.y[row] + fraction * (border.y[row + 1] - border.y[row])
+        x, y = along(border, row, fraction)
         nearest = min(nearest, math.hypot(x_m - x, y_m - y))
-    point = np.empty((1, 2))
-    point[0, 0], point[0, 1] = x_m, y_m
-    return nearest if on_road(course.road, _ALONE, point)[0] else -nearest
+    return nearest if is_on_road(course.road, 0, x_m, y_m) else -nearest
 
 
 @njit(cache=True)
@@ -65,17 +61,18 @@ def distance_m(course, front_point_m, com_x_m, closed, state):  # type: ignore[n
     x, y, cos, sin = origin(state, com_x_m)
     line, x, y = course.center, x + front_point_m * cos, y + front_point_m * sin
     row, fraction = nearest_segment(line, 0, x, y)
-    place = line.start_m[row] + fraction * line.length_m[row]
-    if not closed and row == line.segments[0] - 1 and fraction >= 1.0:
-        heading = line.heading_rad[row]
-        place += (x - line.x[row + 1]) * math.cos(heading) + (y - line.y[row + 1]) * math.sin(heading)
+    begin, end = line.vertices[row], line.vertices[row + 1]
+    place = begin.start_m + fraction * begin.length_m
+    if not closed and row == line.lines[0].segments - 1 and fraction >= 1.0:
+        heading = begin.heading_rad
+        place += (x - end.x) * math.cos(heading) + (y - end.y) * math.sin(heading)
     return place
 
 
 @njit(cache=True)
 def driven_m(course, front_point_m, com_x_m, states, begin_m, closed):  # type: ignore[no-untyped-def]
     """Return how far along the centre line the front of the car is after each state, from `begin_m` on, (n,)."""
-    length_m = course.center.total_m[0]
+    length_m = course.center.lines[0].total_m
     driven = np.empty(len(states))
     before = 0.0
     for n in range(len(states)):
@@ -168,7 +165,7 @@ def _backward(  # type: ignore[no-untyped-def]
     periods = len(commands)
     slope, bend = np.zeros(size), np.zeros((size, size))
     change, free = np.zeros(2), np.zeros(2, np.bool_)
-    length_m = course.center.total_m[0]
+    length_m = course.center.lines[0].total_m
     nudged = states[periods].copy()
     for k in range(_POSE):
         kept = nudged[k]

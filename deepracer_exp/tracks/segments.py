@@ -29,46 +29,63 @@ BAND_M = 0.1
 """Height of the y bands that edges are sorted into; grown until there are at most `MOST_BANDS`."""
 MOST_BANDS = 10_000
 
+# Divisions of NumPy: a check for zero at each would keep compiled loops from being made fast.
+compiled = njit(cache=True, nogil=True, error_model="numpy")
+
+
+LINE = np.dtype(
+    [
+        ("first_row", "i8"),
+        ("segments", "i8"),
+        # Points of the line, repeats included.
+        ("points", "i8"),
+        ("total_m", "f8"),
+        ("bucket_at", "i8"),
+        ("buckets", "i8"),
+        ("low_x", "f8"),
+        ("low_y", "f8"),
+        ("cell_m", "f8"),
+        ("columns", "i8"),
+        ("rows", "i8"),
+        ("cell_at", "i8"),
+    ]
+)
+"""A polyline: its vertices are rows `first_row` to `first_row + segments`, its grid `rows` x `columns` cells."""
+
+VERTEX = np.dtype(
+    [
+        ("x", "f8"),
+        ("y", "f8"),
+        # Of the segment that begins here; 0 at the last vertex of a line.
+        ("length_m", "f8"),
+        # Distance from the line's first vertex along the line, and the same as a share of the whole length, 0 to 1.
+        ("start_m", "f8"),
+        ("share", "f8"),
+        # Direction of the segment that begins here.
+        ("heading_rad", "f8"),
+        # Index among the line's points; of repeated points, the first.
+        ("point", "i8"),
+    ]
+)
+"""A vertex of a polyline, and the segment that begins there."""
+
 
 class Segments(NamedTuple):
-    """One or more polylines, each with its grid (arrays for compiled code).
+    """One or more polylines, each with its grid.
 
-    Line w has `segments[w]` segments, rows `at[w]` to `at[w] + segments[w] - 1`, and one vertex more. Arrays of
-    segments have an unused last row for each line, so that row numbers are the same in all arrays.
+    Records, because compiled code passes each array by seven numbers, which takes longer than a query does.
     """
 
-    x: np.ndarray
-    """Vertices in metres."""
-    y: np.ndarray
-    length_m: np.ndarray
-    """Length of each segment."""
-    start_m: np.ndarray
-    """Distance of each vertex from its line's first along the line."""
-    share: np.ndarray
-    """Position along the line as a share of its whole length, 0 to 1."""
-    heading_rad: np.ndarray
-    """Direction of each segment."""
-    point: np.ndarray
-    """Index of each vertex among the line's points; of repeated points, the first."""
-    points: np.ndarray
-    """Number of points of each line, repeats included."""
-    first_row: np.ndarray
-    segments: np.ndarray
-    total_m: np.ndarray
+    lines: np.ndarray
+    """`LINE` records."""
+    vertices: np.ndarray
+    """`VERTEX` records of all lines."""
     bucket: np.ndarray
-    """Row of the segment at the start of each of equal shares of the line, so that a look-up needs no search."""
-    bucket_at: np.ndarray
-    buckets: np.ndarray
-    low_x: np.ndarray
-    low_y: np.ndarray
-    cell_m: np.ndarray
-    columns: np.ndarray
-    rows: np.ndarray
-    cell_at: np.ndarray
+    """Row of the segment at the start of each of equal shares of a line, so that a look-up needs no search."""
     first: np.ndarray
-    """Candidates of cell k of line w are `member[first[c]:first[c + 1]]` with c = `cell_at[w] + k`, ascending."""
+    """Candidates of cell k of a line are `member[first[c]:first[c + 1]]` with c = `cell_at + k`, ascending."""
     member: np.ndarray
-    """Rows of segments."""
+    """Rows of vertices at which segments begin."""
 
 
 def build_segments(vertices: np.ndarray) -> Segments:
@@ -91,61 +108,48 @@ def build_segments(vertices: np.ndarray) -> Segments:
     while width_m * height_m > MOST_CELLS * cell_m**2:
         cell_m *= 2
     columns, rows = math.ceil(width_m / cell_m), math.ceil(height_m / cell_m)
-    every = np.arange(len(length_m), dtype=np.int32)
+    vertex = np.zeros(len(x), VERTEX)
+    vertex["x"], vertex["y"], vertex["point"] = x, y, point
+    vertex["start_m"], vertex["share"] = start_m, share
+    vertex["length_m"][:-1], vertex["heading_rad"][:-1] = length_m, np.arctan2(dy, dx)
+    every = np.arange(len(length_m))
     columns_c, rows_c = -(-columns // SPLIT), -(-rows // SPLIT)
     whole = (np.array([0, len(every)]), every, 1, SPLIT * max(columns, rows))
-    coarse = _candidates(x, y, low_x, low_y, cell_m * SPLIT, columns_c, rows_c, *whole)
-    first, member = _candidates(x, y, low_x, low_y, cell_m, columns, rows, *coarse, columns_c, SPLIT)
-    beyond = [0.0]
-    return Segments(
-        x=x,
-        y=y,
-        length_m=np.r_[length_m, beyond],
-        start_m=start_m,
-        share=share,
-        heading_rad=np.r_[np.arctan2(dy, dx), beyond],
-        point=point,
-        points=np.array([len(vertices)]),
-        first_row=np.array([0]),
-        segments=np.array([len(length_m)]),
-        total_m=start_m[-1:],
-        bucket=bucket,
-        bucket_at=np.array([0]),
-        buckets=np.array([len(bucket)]),
-        low_x=np.array([low_x]),
-        low_y=np.array([low_y]),
-        cell_m=np.array([cell_m]),
-        columns=np.array([columns]),
-        rows=np.array([rows]),
-        cell_at=np.array([0]),
-        first=first,
-        member=member,
-    )
+    coarse = _candidates(vertex, low_x, low_y, cell_m * SPLIT, columns_c, rows_c, *whole)
+    first, member = _candidates(vertex, low_x, low_y, cell_m, columns, rows, *coarse, columns_c, SPLIT)
+    line = np.zeros(1, LINE)
+    line["segments"], line["points"], line["total_m"] = len(length_m), len(vertices), start_m[-1]
+    line["buckets"] = len(bucket)
+    line["low_x"], line["low_y"], line["cell_m"] = low_x, low_y, cell_m
+    line["columns"], line["rows"] = columns, rows
+    return Segments(line, vertex, bucket, first, member)
 
 
 def join_segments(lines: Sequence[Segments]) -> Segments:
     """Join polylines in their order."""
     moved = {
-        "first_row": "x",
-        "bucket": "x",
-        "bucket_at": "bucket",
-        "cell_at": "first",
+        "lines.first_row": "vertices",
+        "bucket": "vertices",
+        "lines.bucket_at": "bucket",
+        "lines.cell_at": "first",
         "first": "member",
-        "member": "x",
+        "member": "vertices",
     }
     return _joined(lines, moved)
+
+
+POLYGON = np.dtype([("low_y", "f8"), ("band_m", "f8"), ("bands", "i8"), ("first_row", "i8")])
+"""The y bands of a polygon."""
 
 
 class Bands(NamedTuple):
     """The edges of one or more polygons, sorted by y band.
 
-    Band k of polygon w has the rows `first[b]:first[b + 1]` of `edge` with b = `first_row[w] + k`.
+    Band k of a polygon has the rows `first[b]:first[b + 1]` of `edge` with b = `first_row + k`.
     """
 
-    low_y: np.ndarray
-    band_m: np.ndarray
-    bands: np.ndarray
-    first_row: np.ndarray
+    polygons: np.ndarray
+    """`POLYGON` records."""
     first: np.ndarray
     edge: np.ndarray
     """(entries, 4): lower y, upper y, x at the lower end, dx / dy."""
@@ -181,59 +185,61 @@ def build_bands(road: BaseGeometry) -> Bands:
         [low[:, 1], high[:, 1], low[:, 0], (high[:, 0] - low[:, 0]) / (high[:, 1] - low[:, 1])]
     )
     first = np.r_[0, np.cumsum(np.bincount(band, minlength=bands))]
-    return Bands(
-        low_y=np.array([low_y]),
-        band_m=np.array([band_m]),
-        bands=np.array([bands]),
-        first_row=np.array([0]),
-        first=first,
-        edge=np.ascontiguousarray(edges[index]),
-    )
+    polygon = np.zeros(1, POLYGON)
+    polygon["low_y"], polygon["band_m"], polygon["bands"] = low_y, band_m, bands
+    return Bands(polygon, first, np.ascontiguousarray(edges[index]))
 
 
 def join_bands(roads: Sequence[Bands]) -> Bands:
     """Join polygons in their order."""
-    return _joined(roads, {"first_row": "first", "first": "edge"})
+    return _joined(roads, {"polygons.first_row": "first", "first": "edge"})
 
 
 def _joined(parts: Sequence[Any], moved: Mapping[str, str]) -> Any:
-    """Join arrays field by field; those of `moved` hold rows of another field, which follow those of earlier parts."""
+    """Join arrays one by one.
+
+    The arrays, or fields of arrays, that `moved` names hold rows of another array, which follow those of earlier parts.
+    """
     if len(parts) == 1:
         return parts[0]
-    fields: dict[str, list[np.ndarray]] = {
-        name: [getattr(part, name) for part in parts] for name in parts[0]._fields
-    }
+    arrays = {name: [getattr(part, name).copy() for part in parts] for name in parts[0]._fields}
     for name, other in moved.items():
-        begin = np.cumsum([0, *map(len, fields[other][:-1])])
-        fields[name] = [a + by.astype(a.dtype) for a, by in zip(fields[name], begin, strict=True)]
-    return type(parts[0])(**{name: np.concatenate(arrays) for name, arrays in fields.items()})
+        array, _, column = name.partition(".")
+        begins = np.cumsum([0, *map(len, arrays[other][:-1])])
+        for values, begin in zip(arrays[array], begins, strict=True):
+            (values[column] if column else values)[:] += begin
+    return type(parts[0])(**{name: np.concatenate(each) for name, each in arrays.items()})
 
 
-@njit(cache=True, nogil=True)
-def squared_distance(x, y, index, px, py):  # type: ignore[no-untyped-def]
-    """Return the squared distance from (px, py) to segment `index` and the fraction along it."""
-    ax, ay = x[index], y[index]
-    dx, dy = x[index + 1] - ax, y[index + 1] - ay
+@compiled
+def squared_distance(a, b, px, py):  # type: ignore[no-untyped-def]
+    """Return the squared distance from (px, py) to the segment between two `VERTEX` records and the fraction along it.
+
+    All cases are computed and one is selected: branches would be mispredicted.
+    """
+    dx, dy = b.x - a.x, b.y - a.y
     length2 = dx * dx + dy * dy
-    fraction = ((px - ax) * dx + (py - ay) * dy) / length2
+    ax, ay, bx, by = px - a.x, py - a.y, px - b.x, py - b.y
+    along_it, cross = ax * dx + ay * dy, ax * dy - ay * dx
     # At an end the vertex itself is measured: both neighbours then tie exactly and the first one wins,
     # which is what GEOS does.
-    if fraction <= 0.0:
-        return (px - ax) ** 2 + (py - ay) ** 2, 0.0
-    if fraction >= 1.0:
-        return (px - x[index + 1]) ** 2 + (py - y[index + 1]) ** 2, 1.0
-    cross = (px - ax) * dy - (py - ay) * dx
-    return cross * cross / length2, fraction
+    before, behind = along_it <= 0.0, along_it >= length2
+    squared, fraction = cross * cross / length2, along_it / length2
+    squared = ax * ax + ay * ay if before else squared
+    squared = bx * bx + by * by if behind else squared
+    fraction = 0.0 if before else fraction
+    fraction = 1.0 if behind else fraction
+    return squared, fraction
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _candidates(  # type: ignore[no-untyped-def]
-    x, y, low_x, low_y, cell_m, columns, rows, parent_first, parent_member, parent_columns, split
+    vertices, low_x, low_y, cell_m, columns, rows, parent_first, parent_member, parent_columns, split
 ):
     reach = math.sqrt(2.0) * cell_m + 1e-9
     first = np.zeros(columns * rows + 1, np.int64)
-    member = np.empty(4 * columns * rows + len(x), np.int32)
-    distance = np.empty(len(x))
+    member = np.empty(4 * columns * rows + len(vertices), np.int64)
+    distance = np.empty(len(vertices))
     used = 0
     for row in range(rows):
         for column in range(columns):
@@ -242,13 +248,14 @@ def _candidates(  # type: ignore[no-untyped-def]
             begin, end = parent_first[parent], parent_first[parent + 1]
             nearest = np.inf
             for k in range(begin, end):
-                d = math.sqrt(squared_distance(x, y, parent_member[k], px, py)[0])
+                row_k = parent_member[k]
+                d = math.sqrt(squared_distance(vertices[row_k], vertices[row_k + 1], px, py)[0])
                 distance[k - begin] = d
                 nearest = min(nearest, d)
             for k in range(begin, end):
                 if distance[k - begin] <= nearest + reach:
                     if used == len(member):
-                        longer = np.empty(2 * used, np.int32)
+                        longer = np.empty(2 * used, np.int64)
                         longer[:used] = member
                         member = longer
                     member[used] = parent_member[k]
@@ -257,37 +264,64 @@ def _candidates(  # type: ignore[no-untyped-def]
     return first, member[:used].copy()
 
 
-@njit(cache=True, nogil=True)
-def nearest_segment(s, line, px, py):  # type: ignore[no-untyped-def]
+@compiled
+def nearest_segment(s, number, px, py):  # type: ignore[no-untyped-def]
     """Return the row of the line's segment nearest to (px, py) and the fraction along it (nan for a nan point)."""
-    column = (px - s.low_x[line]) / s.cell_m[line]
-    row = (py - s.low_y[line]) / s.cell_m[line]
-    best, nearest, fraction = np.inf, s.first_row[line], np.nan
-    if 0.0 <= column < s.columns[line] and 0.0 <= row < s.rows[line]:
-        cell = s.cell_at[line] + int(row) * s.columns[line] + int(column)
-        for k in range(s.first[cell], s.first[cell + 1]):
-            index = s.member[k]
-            d, f = squared_distance(s.x, s.y, index, px, py)
-            if d < best:
-                best, nearest, fraction = d, index, f
+    line, vertices = s.lines[number], s.vertices
+    column = (px - line.low_x) / line.cell_m
+    row = (py - line.low_y) / line.cell_m
+    in_grid = 0.0 <= column < line.columns and 0.0 <= row < line.rows
+    if in_grid:
+        cell = line.cell_at + int(row) * line.columns + int(column)
+        begin, end = s.first[cell], s.first[cell + 1]
     else:
-        for index in range(s.first_row[line], s.first_row[line] + s.segments[line]):
-            d, f = squared_distance(s.x, s.y, index, px, py)
-            if d < best:
-                best, nearest, fraction = d, index, f
+        begin, end = line.first_row, line.first_row + line.segments
+    best, nearest, fraction = np.inf, line.first_row, np.nan
+    for k in range(begin, end):
+        index = s.member[k] if in_grid else k
+        d, f = squared_distance(vertices[index], vertices[index + 1], px, py)
+        if d < best:
+            best, nearest, fraction = d, index, f
     return nearest, fraction
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def along(s, index, fraction):  # type: ignore[no-untyped-def]
     """Return the point at `fraction` of the segment in row `index`."""
+    a, b = s.vertices[index], s.vertices[index + 1]
     if fraction >= 1.0:
-        return s.x[index + 1], s.y[index + 1]
-    x, y = s.x[index], s.y[index]
-    return x + fraction * (s.x[index + 1] - x), y + fraction * (s.y[index + 1] - y)
+        return b.x, b.y
+    return a.x + fraction * (b.x - a.x), a.y + fraction * (b.y - a.y)
 
 
-@njit(cache=True, nogil=True)
+@compiled
+def project_point(s, number, px, py):  # type: ignore[no-untyped-def]
+    """Project (px, py) on a line.
+
+    Returns:
+        The values of a `track.Projection`; of `center`, x and y.
+    """
+    line, vertices = s.lines[number], s.vertices
+    begin, end = line.first_row, line.first_row + line.segments + 1
+    index, fraction = nearest_segment(s, number, px, py)
+    x, y = along(s, index, fraction)
+    a, b = vertices[index], vertices[index + 1]
+    distance_m = a.start_m + fraction * a.length_m
+    ndist = distance_m / line.total_m
+    off_m = math.sqrt((px - x) ** 2 + (py - y) ** 2)
+    offset_m = off_m if (b.x - a.x) * (py - a.y) - (b.y - a.y) * (px - a.x) >= 0.0 else -off_m
+    # bisect_right from close by: rounding or a projection on a vertex moves it by one at most.
+    ahead = index
+    while ahead < end and vertices[ahead].share <= ndist:
+        ahead += 1
+    while ahead > begin and vertices[ahead - 1].share > ndist:
+        ahead -= 1
+    following = vertices[ahead].point if ahead < end else 0
+    previous = (following if begin < ahead < end else line.points) - 1
+    return ndist, distance_m, offset_m, previous, following, x, y, a.heading_rad
+
+
+@compiled
 def project(s, track_index, points):  # type: ignore[no-untyped-def]
     """Project points (m, 2) on the lines `track_index` (n,), m / n neighbouring points each; see `Tracks.project`."""
     count = len(points)
@@ -296,91 +330,96 @@ def project(s, track_index, points):  # type: ignore[no-untyped-def]
     center, heading_rad = np.empty((count, 2)), np.empty(count)
     for i in range(count):
         line = track_index[i * len(track_index) // count]
-        begin, end = s.first_row[line], s.first_row[line] + s.segments[line] + 1
-        px, py = points[i, 0], points[i, 1]
-        index, fraction = nearest_segment(s, line, px, py)
-        x, y = along(s, index, fraction)
-        center[i, 0], center[i, 1] = x, y
-        distance_m[i] = s.start_m[index] + fraction * s.length_m[index]
-        ndist[i] = distance_m[i] / s.total_m[line]
-        heading_rad[i] = s.heading_rad[index]
-        off_m = math.sqrt((px - x) ** 2 + (py - y) ** 2)
-        dx, dy = s.x[index + 1] - s.x[index], s.y[index + 1] - s.y[index]
-        offset_m[i] = off_m if dx * (py - s.y[index]) - dy * (px - s.x[index]) >= 0.0 else -off_m
-        # bisect_right from close by: rounding or a projection on a vertex moves it by one at most.
-        ahead = index
-        while ahead < end and s.share[ahead] <= ndist[i]:
-            ahead += 1
-        while ahead > begin and s.share[ahead - 1] > ndist[i]:
-            ahead -= 1
-        following[i] = s.point[ahead] if ahead < end else 0
-        previous[i] = (following[i] if begin < ahead < end else s.points[line]) - 1
+        (
+            ndist[i],
+            distance_m[i],
+            offset_m[i],
+            previous[i],
+            following[i],
+            center[i, 0],
+            center[i, 1],
+            heading_rad[i],
+        ) = project_point(s, line, points[i, 0], points[i, 1])
     return ndist, distance_m, offset_m, previous, following, center, heading_rad
 
 
-@njit(cache=True, nogil=True)
+@compiled
+def border_point(inner, outer, number, px, py, x, y, is_clockwise):  # type: ignore[no-untyped-def]
+    """Return the road's width at the projection (x, y) of (px, py), and whether the point is left of its centre."""
+    index, fraction = nearest_segment(inner, number, x, y)
+    inner_x, inner_y = along(inner, index, fraction)
+    index, fraction = nearest_segment(outer, number, x, y)
+    outer_x, outer_y = along(outer, index, fraction)
+    width_m = math.sqrt((inner_x - outer_x) ** 2 + (inner_y - outer_y) ** 2)
+    to_inner = math.sqrt((px - inner_x) ** 2 + (py - inner_y) ** 2)
+    to_outer = math.sqrt((px - outer_x) ** 2 + (py - outer_y) ** 2)
+    return width_m, (to_inner < to_outer) != is_clockwise
+
+
+@compiled
 def border_distances(inner, outer, track_index, points, center, is_clockwise):  # type: ignore[no-untyped-def]
     """Return the road's width at projected points and whether the points are left of its centre."""
     count = len(points)
     width_m, is_left = np.empty(count), np.empty(count, np.bool_)
     for i in range(count):
         line = track_index[i * len(track_index) // count]
-        index, fraction = nearest_segment(inner, line, center[i, 0], center[i, 1])
-        inner_x, inner_y = along(inner, index, fraction)
-        index, fraction = nearest_segment(outer, line, center[i, 0], center[i, 1])
-        outer_x, outer_y = along(outer, index, fraction)
-        px, py = points[i, 0], points[i, 1]
-        width_m[i] = math.sqrt((inner_x - outer_x) ** 2 + (inner_y - outer_y) ** 2)
-        to_inner = math.sqrt((px - inner_x) ** 2 + (py - inner_y) ** 2)
-        to_outer = math.sqrt((px - outer_x) ** 2 + (py - outer_y) ** 2)
-        is_left[i] = (to_inner < to_outer) != is_clockwise[line]
+        px, py, x, y = points[i, 0], points[i, 1], center[i, 0], center[i, 1]
+        width_m[i], is_left[i] = border_point(inner, outer, line, px, py, x, y, is_clockwise[line])
     return width_m, is_left
 
 
-@njit(cache=True, nogil=True)
+@compiled
+def pose_at(s, closed, number, ndist):  # type: ignore[no-untyped-def]
+    """Return x, y and heading of a line at a normalised distance, which wraps if it is closed."""
+    line, vertices = s.lines[number], s.vertices
+    begin, last = line.first_row, line.first_row + line.segments - 1
+    share = ndist - math.floor(ndist) if closed else min(max(ndist, 0.0), 1.0)
+    if not math.isfinite(share):
+        return np.nan, np.nan, np.nan
+    index = s.bucket[line.bucket_at + min(int(share * line.buckets), line.buckets - 1)]
+    while index < last and vertices[index + 1].share <= share:
+        index += 1
+    while index > begin and vertices[index].share > share:
+        index -= 1
+    a = vertices[index]
+    x, y = along(s, index, (share * line.total_m - a.start_m) / a.length_m)
+    return x, y, a.heading_rad
+
+
+@compiled
 def poses_at(s, closed, track_index, ndist):  # type: ignore[no-untyped-def]
     """Return x, y and heading of the lines at normalised distances."""
     count = len(ndist)
     x, y, heading_rad = np.empty(count), np.empty(count), np.empty(count)
     for i in range(count):
         line = track_index[i * len(track_index) // count]
-        begin, last = s.first_row[line], s.first_row[line] + s.segments[line] - 1
-        share = ndist[i] - math.floor(ndist[i]) if closed[line] else min(max(ndist[i], 0.0), 1.0)
-        if math.isfinite(share):
-            buckets = s.buckets[line]
-            index = s.bucket[s.bucket_at[line] + min(int(share * buckets), buckets - 1)]
-            while index < last and s.share[index + 1] <= share:
-                index += 1
-            while index > begin and s.share[index] > share:
-                index -= 1
-            fraction = (share * s.total_m[line] - s.start_m[index]) / s.length_m[index]
-            x[i], y[i] = along(s, index, fraction)
-            heading_rad[i] = s.heading_rad[index]
-        else:
-            x[i], y[i], heading_rad[i] = np.nan, np.nan, np.nan
+        x[i], y[i], heading_rad[i] = pose_at(s, closed[line], line, ndist[i])
     return x, y, heading_rad
 
 
-@njit(cache=True, nogil=True)
+@compiled
+def is_on_road(b, number, px, py):  # type: ignore[no-untyped-def]
+    """Return whether a ray to the right of (px, py) crosses an odd number of edges of a polygon."""
+    polygon = b.polygons[number]
+    band = (py - polygon.low_y) / polygon.band_m
+    odd = False
+    # The top edge can round into the band above the last; nan falls through both comparisons.
+    if 0.0 <= band < polygon.bands + 1:
+        k = polygon.first_row + min(int(band), polygon.bands - 1)
+        for j in range(b.first[k], b.first[k + 1]):
+            if b.edge[j, 0] <= py < b.edge[j, 1]:
+                odd ^= px < b.edge[j, 2] + (py - b.edge[j, 0]) * b.edge[j, 3]
+    return odd
+
+
+@compiled
 def on_road(b, track_index, points):  # type: ignore[no-untyped-def]
-    """Return for points (m, 2) whether a ray to the right crosses an odd number of edges of their polygon.
+    """Return for points (m, 2) whether they are inside their polygon.
 
     `track_index` (n,) has the polygon of each m / n neighbouring points.
     """
     inside = np.zeros(len(points), np.bool_)
     for i in range(len(points)):
         road = track_index[i * len(track_index) // len(points)]
-        px, py = points[i, 0], points[i, 1]
-        band = (py - b.low_y[road]) / b.band_m[road]
-        # The top edge can round into the band above the last; nan falls through both comparisons.
-        if 0.0 <= band < b.bands[road] + 1:
-            k = b.first_row[road] + min(int(band), b.bands[road] - 1)
-            odd = False
-            for j in range(b.first[k], b.first[k + 1]):
-                if (
-                    b.edge[j, 0] <= py < b.edge[j, 1]
-                    and px < b.edge[j, 2] + (py - b.edge[j, 0]) * b.edge[j, 3]
-                ):
-                    odd = not odd
-            inside[i] = odd
+        inside[i] = is_on_road(b, road, points[i, 0], points[i, 1])
     return inside

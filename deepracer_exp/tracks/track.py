@@ -144,7 +144,7 @@ class Track:
             waypoints=waypoints,
             inner=inner,
             outer=outer,
-            length_m=float(center_line.start_m[-1]),
+            length_m=float(center_line.vertices["start_m"][-1]),
             width_m=float(np.median(widths_m)),
             width_min_m=float(widths_m.min()),
             width_max_m=float(widths_m.max()),

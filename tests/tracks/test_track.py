@@ -159,8 +159,9 @@ def test_the_candidates_of_a_place_on_the_road_do_not_depend_on_the_length_of_th
         x = np.arange(0.0, 6.0 * bends, 0.15)
         line = np.column_stack([x, np.sin(x * np.pi / 3)])
         grid = build_segments(line)
-        cells = ((line - [grid.low_x[0], grid.low_y[0]]) / grid.cell_m).astype(int)
-        cell = cells[:, 1] * grid.columns + cells[:, 0]
+        of = grid.lines[0]
+        cells = ((line - [of["low_x"], of["low_y"]]) / of["cell_m"]).astype(int)
+        cell = cells[:, 1] * of["columns"] + cells[:, 0]
         return float(np.diff(grid.first)[cell].mean())
 
     assert mean_candidates(40) <= 1.05 * mean_candidates(4)
@@ -172,7 +173,7 @@ def test_the_candidates_grow_no_faster_than_the_density_of_the_points(catalogue_
     track = catalogue_track("AWS_track")
     dense = track.points_at(np.linspace(0, 1, denser * (len(track.waypoints) - 1) + 1))
     few, many = build_segments(track.waypoints), build_segments(dense)
-    assert many.columns * many.rows == few.columns * few.rows
+    assert many.lines["columns"] * many.lines["rows"] == few.lines["columns"] * few.lines["rows"]
     assert len(many.member) <= 1.1 * denser * len(few.member)
 
 
