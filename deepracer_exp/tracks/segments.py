@@ -29,8 +29,10 @@ BAND_M = 0.1
 """Height of the y bands that edges are sorted into; grown until there are at most `MOST_BANDS`."""
 MOST_BANDS = 10_000
 
-# Divisions of NumPy: a check for zero at each would keep compiled loops from being made fast.
+# Divisions as NumPy's: a check for zero at each would keep loops from being optimized.
 compiled = njit(cache=True, nogil=True, error_model="numpy")
+# A query takes less time than passing all arrays to a function.
+inlined = njit(cache=True, nogil=True, error_model="numpy", inline="always")
 
 
 LINE = np.dtype(
@@ -211,7 +213,7 @@ def _joined(parts: Sequence[Any], moved: Mapping[str, str]) -> Any:
     return type(parts[0])(**{name: np.concatenate(each) for name, each in arrays.items()})
 
 
-@compiled
+@inlined
 def squared_distance(a, b, px, py):  # type: ignore[no-untyped-def]
     """Return the squared distance from (px, py) to the segment between two `VERTEX` records and the fraction along it.
 
@@ -264,7 +266,7 @@ def _candidates(  # type: ignore[no-untyped-def]
     return first, member[:used].copy()
 
 
-@compiled
+@inlined
 def nearest_segment(s, number, px, py):  # type: ignore[no-untyped-def]
     """Return the row of the line's segment nearest to (px, py) and the fraction along it (nan for a nan point)."""
     line, vertices = s.lines[number], s.vertices
@@ -285,7 +287,7 @@ def nearest_segment(s, number, px, py):  # type: ignore[no-untyped-def]
     return nearest, fraction
 
 
-@compiled
+@inlined
 def along(s, index, fraction):  # type: ignore[no-untyped-def]
     """Return the point at `fraction` of the segment in row `index`."""
     a, b = s.vertices[index], s.vertices[index + 1]
@@ -294,7 +296,7 @@ def along(s, index, fraction):  # type: ignore[no-untyped-def]
     return a.x + fraction * (b.x - a.x), a.y + fraction * (b.y - a.y)
 
 
-@compiled
+@inlined
 def project_point(s, number, px, py):  # type: ignore[no-untyped-def]
     """Project (px, py) on a line.
 
@@ -343,7 +345,7 @@ def project(s, track_index, points):  # type: ignore[no-untyped-def]
     return ndist, distance_m, offset_m, previous, following, center, heading_rad
 
 
-@compiled
+@inlined
 def border_point(inner, outer, number, px, py, x, y, is_clockwise):  # type: ignore[no-untyped-def]
     """Return the road's width at the projection (x, y) of (px, py), and whether the point is left of its centre."""
     index, fraction = nearest_segment(inner, number, x, y)
@@ -368,7 +370,7 @@ def border_distances(inner, outer, track_index, points, center, is_clockwise):  
     return width_m, is_left
 
 
-@compiled
+@inlined
 def pose_at(s, closed, number, ndist):  # type: ignore[no-untyped-def]
     """Return x, y and heading of a line at a normalised distance, which wraps if it is closed."""
     line, vertices = s.lines[number], s.vertices
@@ -397,7 +399,7 @@ def poses_at(s, closed, track_index, ndist):  # type: ignore[no-untyped-def]
     return x, y, heading_rad
 
 
-@compiled
+@inlined
 def is_on_road(b, number, px, py):  # type: ignore[no-untyped-def]
     """Return whether a ray to the right of (px, py) crosses an odd number of edges of a polygon."""
     polygon = b.polygons[number]
