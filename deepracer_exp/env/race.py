@@ -10,7 +10,7 @@ from deepracer_exp.config.driving import RandomizationConfig
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.rewards.prints import RewardPrints
 from deepracer_exp.rewards.reward import RewardFunction
-from deepracer_exp.sim.batch import CarBatch, CarState
+from deepracer_exp.sim.batch import CarBatch
 from deepracer_exp.tracks.lanes import INNER, OUTER, Lanes
 from deepracer_exp.tracks.track import Pose
 
@@ -446,12 +446,9 @@ class Race:
 
     def _observe_started(self, ids: np.ndarray) -> None:
         """Observe only the cars `ids`, just put on the track: with many cars, some start at nearly every step."""
-        state = self._batch.read()
-        if len(ids) == self.n_cars:
-            started = self.rules.measure(state)
-        else:
-            state = CarState(*(values[ids] for values in state))
-            started = self.rules.measure_some(ids, state)
+        state = self._batch.read(ids)
+        everyone = len(ids) == self.n_cars
+        started = self.rules.measure(state) if everyone else self.rules.measure_some(ids, state)
         # The terminal observation has been handed out; it must stay as it was.
         self.observation = self.observation.copy()
         self.observation[ids] = self.randomization.disturb_first_observation(

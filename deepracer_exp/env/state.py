@@ -1,5 +1,6 @@
 """Positions of cars relative to the track, and arrays of cars read back from a checkpoint."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.sim.batch import CarState
+from deepracer_exp.tracks.segments import border_point, compiled, project_point
 from deepracer_exp.tracks.track import TrackIndex, Tracks
 
 Floats = NDArray[np.float64]
@@ -66,29 +68,10 @@ class Measures:
     @classmethod
     def of(cls, car: CarState, front_point_m: float, tracks: Tracks, track_index: TrackIndex) -> "Measures":
         """Measure cars (N,), whose front point is `front_point_m` ahead of the origin, each against its course (N,)."""
-        front = np.empty((len(car.x_m), 2))
-        front[:, 0] = car.x_m + front_point_m * np.cos(car.yaw_rad)
-        front[:, 1] = car.y_m + front_point_m * np.sin(car.yaw_rad)
-        projection = tracks.project(front, track_index)
-        track_width_m, is_left = tracks.border_distances(front, projection.center, track_index)
-        error = car.yaw_rad - projection.heading_rad
-        closest = np.empty((len(front), 2), np.int64)
-        closest[:, 0], closest[:, 1] = projection.previous, projection.next
-        return cls(
-            x_m=car.x_m,
-            y_m=car.y_m,
-            yaw_rad=car.yaw_rad,
-            speed_mps=car.speed_mps,
-            yaw_rate_radps=car.yaw_rate_radps,
-            front=front,
-            ndist=projection.ndist,
-            distance_m=np.abs(projection.offset_m),
-            offset_m=projection.offset_m,
-            closest_waypoints=closest,
-            heading_error_rad=np.mod(error + np.pi, 2 * np.pi) - np.pi,
-            track_width_m=track_width_m,
-            is_left=is_left,
+        measured = _measure(
+            car.x_m, car.y_m, car.yaw_rad, front_point_m, *tracks.lines, tracks.clockwise, track_index
         )
+        return cls(car.x_m, car.y_m, car.yaw_rad, car.speed_mps, car.yaw_rate_radps, *measured)
 
     @classmethod
     def example(cls, n_cars: int) -> "Measures":
@@ -120,3 +103,27 @@ class Measures:
         """Replace the rows of the cars `ids` by those of `those`."""
         for field in fields(self):
             getattr(self, field.name)[ids] = getattr(those, field.name)
+
+
+@compiled
+def _measure(x_m, y_m, yaw_rad, front_point_m, center, inner, outer, clockwise, track_index):  # type: ignore[no-untyped-def]
+    """Return the arrays of `Measures` from `front` on."""
+    cars = len(x_m)
+    front, ndist, closest = np.empty((cars, 2)), np.empty(cars), np.empty((cars, 2), np.int64)
+    distance_m, offset_m, error_rad = np.empty(cars), np.empty(cars), np.empty(cars)
+    width_m, is_left = np.empty(cars), np.empty(cars, np.bool_)
+    for car in range(cars):
+        line = track_index[car]
+        x = x_m[car] + front_point_m * math.cos(yaw_rad[car])
+        y = y_m[car] + front_point_m * math.sin(yaw_rad[car])
+        share, _, offset, previous, following, center_x, center_y, heading_rad = project_point(
+            center, line, x, y
+        )
+        width_m[car], is_left[car] = border_point(
+            inner, outer, line, x, y, center_x, center_y, clockwise[line]
+        )
+        front[car, 0], front[car, 1], ndist[car] = x, y, share
+        distance_m[car], offset_m[car] = abs(offset), offset
+        closest[car, 0], closest[car, 1] = previous, following
+        error_rad[car] = (yaw_rad[car] - heading_rad + math.pi) % (2 * math.pi) - math.pi
+    return front, ndist, distance_m, offset_m, closest, error_rad, width_m, is_left

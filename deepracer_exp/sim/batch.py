@@ -1,12 +1,13 @@
 """All cars of a process, stepped together."""
 
+import math
 import os
 from typing import NamedTuple
 
 import mujoco
 import mujoco.batch
 import numpy as np
-from numba import cfunc
+from numba import cfunc, njit
 from numpy.typing import ArrayLike, NDArray
 
 from deepracer_exp.config.car import CarConfig
@@ -79,18 +80,15 @@ class CarBatch:
         self._commands: Floats = np.empty((n_cars, 2))
         self._max_steering_rad = np.deg2rad(car.max_steering_deg)
         self._rest_row = self._rows[0].copy()
+        self._everyone = np.arange(n_cars)
+        self._all_move = np.ones(n_cars, bool)
 
     def place(self, ids: Ids, x_m: Floats, y_m: Floats, yaw_rad: Floats) -> None:
         """Put cars at rest, steering straight, with a fresh physics state.
 
         The cars are distinct; position of the chassis origin and heading are (n,) each.
         """
-        com = self.car.com_x_m
-        self._rows[ids] = self._rest_row
-        # The joints move the centre of mass, from where it is when the chassis origin is at the world's.
-        self._qpos[ids, 0] = x_m + com * (np.cos(yaw_rad) - 1.0)
-        self._qpos[ids, 1] = y_m + com * np.sin(yaw_rad)
-        self._qpos[ids, 2] = yaw_rad
+        _place(ids, x_m, y_m, yaw_rad, self.car.com_x_m, self._rest_row, self._rows, self._qpos)
 
     @property
     def acceleration_mps2(self) -> Floats:
@@ -113,11 +111,9 @@ class CarBatch:
         """
         commands = self._commands
         commands[:, 0], commands[:, 1] = speed_mps, steering_rad
-        _require_finite("command", np.isfinite(commands))
-        np.clip(commands[:, 0], self.car.min_speed_mps, self.car.max_speed_mps, out=commands[:, 0])
-        np.clip(commands[:, 1], -self._max_steering_rad, self._max_steering_rad, out=commands[:, 1])
-        if moving is not None:
-            commands *= moving[:, None]
+        _require_finite("command", commands)
+        moving = self._all_move if moving is None else moving
+        _limit(commands, moving, self.car.min_speed_mps, self.car.max_speed_mps, self._max_steering_rad)
         steps, dt_s = self.car.substeps, self.model.opt.timestep
         for step in range(steps):
             yaw = self._qpos[:, 2]
@@ -126,22 +122,13 @@ class CarBatch:
                 self._batch.step()
             except mujoco.batch.SimulationError as error:
                 raise RunFailed(f"car {int(error.ids[0])}: {error}") from error
-        _require_finite("physics state", np.isfinite(self._moving))
+        _require_finite("physics state", self._moving)
 
-    def read(self) -> CarState:
-        """Return position and motion of all cars."""
-        x, y, yaw = self._qpos.T
-        vx, vy, rate = self._qvel.T
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        com = self.car.com_x_m
-        return CarState(
-            x_m=x - com * (cos - 1.0),
-            y_m=y - com * sin,
-            yaw_rad=np.arctan2(sin, cos),
-            speed_mps=cos * vx + sin * vy,
-            lateral_mps=cos * vy - sin * vx - com * rate,
-            yaw_rate_radps=rate.copy(),
-        )
+    def read(self, ids: Ids | None = None) -> CarState:
+        """Return position and motion of the cars `ids`, (n,) each; None: of all."""
+        ids = self._everyone if ids is None else ids
+        x_m, y_m, cos, sin, *motion = _read(ids, self._qpos, self._qvel, self.car.com_x_m)
+        return CarState(x_m, y_m, np.arctan2(sin, cos), *motion)
 
     @property
     def state(self) -> Floats:
@@ -190,7 +177,56 @@ class CarBatch:
         self._cars["speed_delay"][ids] = speed_delay_s * self.car.control_hz
 
 
-def _require_finite(what: str, finite: NDArray[np.bool_]) -> None:
+def _require_finite(what: str, values: Floats) -> None:
     """Raise RunFailed for the first car, (N, k), of which a number is not finite."""
-    if not finite.all():
-        raise RunFailed(f"car {int(np.argmin(finite.all(axis=1)))}: {what} is not finite")
+    car = _first_lost(values)
+    if car >= 0:
+        raise RunFailed(f"car {car}: {what} is not finite")
+
+
+@njit(cache=True, nogil=True)
+def _first_lost(values):  # type: ignore[no-untyped-def]
+    """Return the first row of which a number is not finite, -1 if there is none."""
+    for car in range(len(values)):
+        for value in values[car]:
+            if not math.isfinite(value):
+                return car
+    return -1
+
+
+@njit(cache=True, nogil=True)
+def _limit(commands, moving, min_mps, max_mps, max_rad):  # type: ignore[no-untyped-def]
+    """Clip commanded speeds and angles in place, (N, 2), and make them zero for cars that are not moving, (N,)."""
+    for car in range(len(commands)):
+        commands[car, 0] = min(max(commands[car, 0], min_mps), max_mps) * moving[car]
+        commands[car, 1] = min(max(commands[car, 1], -max_rad), max_rad) * moving[car]
+
+
+@njit(cache=True, nogil=True)
+def _place(ids, x_m, y_m, yaw_rad, com_m, rest, rows, qpos):  # type: ignore[no-untyped-def]
+    """Put the cars `ids` at rest in `rows`, their states, of which `qpos` is a part; see `CarBatch.place`."""
+    for i in range(len(ids)):
+        car, yaw = ids[i], yaw_rad[i]
+        rows[car] = rest
+        # The joints move the centre of mass, from where it is when the chassis origin is at the world's.
+        qpos[car, 0] = x_m[i] + com_m * (math.cos(yaw) - 1.0)
+        qpos[car, 1] = y_m[i] + com_m * math.sin(yaw)
+        qpos[car, 2] = yaw
+
+
+@njit(cache=True, nogil=True)
+def _read(ids, qpos, qvel, com_m):  # type: ignore[no-untyped-def]
+    """Return where the chassis origins of the cars `ids` are, their headings' cosines and sines, and their motion."""
+    count = len(ids)
+    x_m, y_m, cosines, sines = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
+    ahead_mps, left_mps, rate_radps = np.empty(count), np.empty(count), np.empty(count)
+    for i in range(count):
+        car = ids[i]
+        cos, sin = math.cos(qpos[car, 2]), math.sin(qpos[car, 2])
+        vx, vy, rate = qvel[car, 0], qvel[car, 1], qvel[car, 2]
+        x_m[i] = qpos[car, 0] - com_m * (cos - 1.0)
+        y_m[i] = qpos[car, 1] - com_m * sin
+        cosines[i], sines[i], rate_radps[i] = cos, sin, rate
+        ahead_mps[i] = cos * vx + sin * vy
+        left_mps[i] = cos * vy - sin * vx - com_m * rate
+    return x_m, y_m, cosines, sines, ahead_mps, left_mps, rate_radps

@@ -261,47 +261,52 @@ class Tracks:
     Attributes:
         length_m: length of each course, (W,).
         closed: whether each course is closed, (W,), bool.
+        clockwise: whether each course is driven clockwise, (W,), bool.
+        lines: the centre lines, the inner and the outer borders, for compiled code.
+        road: the roads, for compiled code.
     """
 
     def __init__(self, tracks: Sequence[Track]):
         """Join courses; the index of a course is its index in `tracks`."""
         self.length_m = np.array([track.length_m for track in tracks])
         self.closed = np.array([track.closed for track in tracks])
-        self._clockwise = np.array([track.is_clockwise for track in tracks])
+        self.clockwise = np.array([track.is_clockwise for track in tracks])
         self._waypoints = np.concatenate([track.waypoints for track in tracks])
         self._waypoint_at = np.cumsum([0, *(len(track.waypoints) for track in tracks[:-1])])
-        self._center_line = segments.join_segments([track._center_line for track in tracks])
-        self._inner_line = segments.join_segments([track._inner_line for track in tracks])
-        self._outer_line = segments.join_segments([track._outer_line for track in tracks])
-        self._bands = segments.join_bands([track._bands for track in tracks])
+        self.lines = (
+            segments.join_segments([track._center_line for track in tracks]),
+            segments.join_segments([track._inner_line for track in tracks]),
+            segments.join_segments([track._outer_line for track in tracks]),
+        )
+        self.road = segments.join_bands([track._bands for track in tracks])
 
     def project(self, points: np.ndarray, track_index: TrackIndex) -> Projection:
         """Project points (m, 2) on the centre lines, as `Track.project` does."""
-        return Projection(*segments.project(self._center_line, track_index, _points(points)))
+        return Projection(*segments.project(self.lines[0], track_index, _points(points)))
 
     def border_distances(self, points: np.ndarray, center: np.ndarray, track_index: TrackIndex) -> Borders:
         """Return width and side as `Track.border_distances` does, (m,) each, for points and centres (m, 2)."""
-        borders = self._inner_line, self._outer_line
+        _, *borders = self.lines
         return Borders(
             *segments.border_distances(
-                *borders, track_index, _points(points), _points(center), self._clockwise
+                *borders, track_index, _points(points), _points(center), self.clockwise
             )
         )
 
     def on_road(self, points: np.ndarray, track_index: TrackIndex) -> np.ndarray:
         """Return for points (m, 2) whether they are inside the road of their course (bool)."""
-        return segments.on_road(self._bands, track_index, _points(points))
+        return segments.on_road(self.road, track_index, _points(points))
 
     def points_at(self, ndist: np.ndarray, track_index: TrackIndex) -> np.ndarray:
         """Return the centre-line points (..., 2) at normalised distances, as `Track.points_at` does."""
         ndist = np.asarray(ndist, np.float64)
-        x, y, _ = segments.poses_at(self._center_line, self.closed, track_index, ndist.ravel())
+        x, y, _ = segments.poses_at(self.lines[0], self.closed, track_index, ndist.ravel())
         return np.stack([x, y], axis=-1).reshape(*ndist.shape, 2)
 
     def start_pose(self, ndist: np.ndarray, track_index: TrackIndex) -> Pose:
         """Return poses on the centre lines as `Track.start_pose` does; arrays shaped as `ndist`."""
         ndist = np.asarray(ndist, np.float64)
-        pose = segments.poses_at(self._center_line, self.closed, track_index, ndist.ravel())
+        pose = segments.poses_at(self.lines[0], self.closed, track_index, ndist.ravel())
         return Pose(*(part.reshape(ndist.shape) for part in pose))
 
     def waypoints(self, index: np.ndarray, track_index: TrackIndex) -> np.ndarray:
