@@ -1,5 +1,6 @@
 """The features of an observation."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 from deepracer_exp.config.driving import ObservationConfig, ObservationShape
 from deepracer_exp.config.own_class import OwnClass, build_own
 from deepracer_exp.errors import BadInput, reading
+from deepracer_exp.tracks.segments import compiled, pose_at
 from deepracer_exp.tracks.track import TrackIndex, Tracks
 
 from .state import Measures
@@ -123,8 +125,13 @@ class Features:
     ):
         self._config, self._tracks = config, tracks
         self._ahead_ndist = np.asarray(config.lookahead_m) / tracks.length_m[:, None]
-        self._steering_max_deg = steering_max_deg
-        self._speed_max_mps = speed_max_mps
+        self._scales = (
+            float(config.speed_scale_mps),
+            float(config.yaw_rate_scale_radps),
+            float(steering_max_deg),
+            float(speed_max_mps),
+            float(config.lookahead_scale_m),
+        )
         self._parts = parts
         self.names = _names(config, parts)
 
@@ -146,22 +153,26 @@ class Features:
             others: what is observed of the next boxes and bots, (N, len(OTHERS) * next_objects); None: there are none.
         """
         config = self._config
-        road = self._tracks.points_at(now.ndist[:, None] + self._ahead_ndist[track_index], track_index)
         out = np.empty((len(now.front), len(self.names)), np.float32)
-        out[:, 0] = 2 * now.offset_m / now.track_width_m
-        out[:, 1] = np.sin(now.heading_error_rad)
-        out[:, 2] = np.cos(now.heading_error_rad)
-        out[:, 3] = now.speed_mps / config.speed_scale_mps
-        out[:, 4] = now.yaw_rate_radps / config.yaw_rate_scale_radps
-        out[:, 5] = steering_deg / self._steering_max_deg
-        out[:, 6] = commanded_mps / self._speed_max_mps
-        dx = road[:, :, 0] - now.front[:, None, 0]
-        dy = road[:, :, 1] - now.front[:, None, 1]
-        cos = np.cos(now.yaw_rad)[:, None] / config.lookahead_scale_m
-        sin = np.sin(now.yaw_rad)[:, None] / config.lookahead_scale_m
-        end = 7 + 2 * road.shape[1]
-        out[:, 7:end:2] = dx * cos + dy * sin
-        out[:, 8:end:2] = dy * cos - dx * sin
+        _features(
+            now.front,
+            now.yaw_rad,
+            now.speed_mps,
+            now.yaw_rate_radps,
+            now.ndist,
+            now.offset_m,
+            now.heading_error_rad,
+            now.track_width_m,
+            track_index,
+            steering_deg,
+            commanded_mps,
+            self._scales,
+            self._tracks.lines[0],
+            self._tracks.closed,
+            self._ahead_ndist,
+            out,
+        )
+        end = 7 + 2 * len(config.lookahead_m)
         if config.next_objects:
             begin, end = end, end + len(OTHERS) * config.next_objects
             out[:, begin:end] = np.tile(_ABSENT, config.next_objects) if others is None else others
@@ -169,3 +180,41 @@ class Features:
             begin, end = end, end + len(part.names)
             out[:, begin:end] = part.compute(now, steering_deg, commanded_mps)
         return out
+
+
+@compiled
+def _features(  # type: ignore[no-untyped-def]
+    front,
+    yaw_rad,
+    speed_mps,
+    yaw_rate_radps,
+    ndist,
+    offset_m,
+    heading_error_rad,
+    track_width_m,
+    track_index,
+    steering_deg,
+    commanded_mps,
+    scales,
+    center,
+    closed,
+    ahead_ndist,
+    out,
+):
+    """Write the features up to those of the look-ahead distances; arrays as in `Measures` and `Features.compute`."""
+    speed_scale_mps, rate_scale_radps, steering_max_deg, speed_max_mps, ahead_scale_m = scales
+    for car in range(len(out)):
+        line = track_index[car]
+        out[car, 0] = 2 * offset_m[car] / track_width_m[car]
+        out[car, 1] = math.sin(heading_error_rad[car])
+        out[car, 2] = math.cos(heading_error_rad[car])
+        out[car, 3] = speed_mps[car] / speed_scale_mps
+        out[car, 4] = yaw_rate_radps[car] / rate_scale_radps
+        out[car, 5] = steering_deg[car] / steering_max_deg
+        out[car, 6] = commanded_mps[car] / speed_max_mps
+        cos, sin = math.cos(yaw_rad[car]) / ahead_scale_m, math.sin(yaw_rad[car]) / ahead_scale_m
+        for number in range(ahead_ndist.shape[1]):
+            x, y, _ = pose_at(center, closed[line], line, ndist[car] + ahead_ndist[line, number])
+            dx, dy = x - front[car, 0], y - front[car, 1]
+            out[car, 7 + 2 * number] = dx * cos + dy * sin
+            out[car, 8 + 2 * number] = dy * cos - dx * sin
