@@ -1,5 +1,6 @@
 """The rules of a race as the service's simulator applies them: progress, wheels on the road, the end of an episode."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from deepracer_exp.config.driving import EpisodeConfig
 from deepracer_exp.rewards.params import TrackParams
 from deepracer_exp.sim.batch import CarState
+from deepracer_exp.tracks.segments import compiled, is_on_road, pose_at
 from deepracer_exp.tracks.track import Pose, Tracks
 
 from .setup import RaceSetup, courses_of_cars
@@ -25,30 +27,50 @@ _KEPT = {
     "track_index": "which",
 }
 """The arrays that later steps depend on, and their keys in a checkpoint."""
+_NOWHERE = np.zeros(0)
 
 
-def lap_progress(
-    ndist: np.ndarray, start_ndist: np.ndarray, previous: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+_CODES = tuple(
+    STATUS_CODE[status]
+    for status in (
+        "prepare",
+        "in_progress",
+        "reversed",
+        "immobilized",
+        "off_track",
+        "lap_complete",
+        "time_up",
+    )
+)
+_ENDINGS = tuple(STATUS_CODE[status] for status in ("in_progress", "pause", "lap_complete", "time_up"))
+"""Codes that compiled rules are given: what they have compiled is kept where a change of the codes is not noticed."""
+
+
+@compiled
+def lap_progress(ndist, start_ndist, previous):  # type: ignore[no-untyped-def]
     """Return progress in per cent and the value to pass as `previous` at the next step.
 
     The rule is that of deepracer-simapp (agent_ctrl/utils.py): a fall by more than half a lap means that
     the start line was passed forwards, a rise by more than half a lap that the car rolled back over it.
 
     Args:
-        ndist: Normalised projections on the centre line, 0 to 1, of any shape.
-        start_ndist: Where each episode began, 0 to 1.
+        ndist: Normalised projection on the centre line, 0 to 1.
+        start_ndist: Where the episode began, 0 to 1.
         previous: Second result of the step before; 0 at an episode's first step.
 
     Returns:
         Progress (at most 100; below 0 behind the start), and the next `previous` (0 after a full lap).
     """
     p = 100.0 * (ndist - start_ndist)
-    p = np.where(p <= 0.0, p + 100.0, p)
-    p = np.where(previous > p + 50.0, p + 100.0, p)
-    p = np.where(p > previous + 50.0, p - 100.0, p)
-    p = np.minimum(p, 100.0)
-    return p, np.where(p == 100.0, 0.0, p)
+    if p <= 0.0:
+        p += 100.0
+    if previous > p + 50.0:
+        p += 100.0
+    if p > previous + 50.0:
+        p -= 100.0
+    if p >= 100.0:
+        return 100.0, 0.0
+    return p, p
 
 
 def lap_clock_s(steps: ArrayLike, period_s: float) -> Floats:
@@ -69,9 +91,19 @@ class EpisodeRules:
     """
 
     def __init__(self, config: EpisodeConfig, n_cars: int):
-        self._config = config
+        self.limits = (
+            config.max_steps,
+            config.immobilized_steps,
+            float(config.immobilized_m),
+            config.reversed_steps,
+        )
         self._still = np.zeros(n_cars, np.int64)
         self._falling = np.zeros(n_cars, np.int64)
+
+    @property
+    def counters(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """For how many steps the cars have stood, and for how many they have driven backwards, (N,) each."""
+        return self._still, self._falling
 
     def reset(self, ids: np.ndarray) -> None:
         """Set the counters of the cars `ids` to zero."""
@@ -100,21 +132,58 @@ class EpisodeRules:
         The prepare step is step 1; `moved_m` is the distance since the step before, and `off_track` means that no wheel
         is on the road. Where several rules hold, the service's priority decides: time_up, lap_complete, the others.
         """
-        config = self._config
-        running = steps > 1
-        self._still = np.where(running & (moved_m <= config.immobilized_m), self._still + 1, 0)
-        self._falling = np.where(running & (progress < last_progress), self._falling + 1, 0)
-        status = np.full(len(steps), STATUS_CODE["in_progress"])
-        if config.reversed_steps:
-            status[self._falling >= config.reversed_steps] = STATUS_CODE["reversed"]
-        if config.immobilized_steps:
-            status[self._still >= config.immobilized_steps] = STATUS_CODE["immobilized"]
-        status[off_track] = STATUS_CODE["off_track"]
-        status[progress >= 100.0] = STATUS_CODE["lap_complete"]
-        if config.max_steps:
-            status[steps >= config.max_steps] = STATUS_CODE["time_up"]
-        status[~running] = STATUS_CODE["prepare"]
+        status = np.empty(len(steps), np.int64)
+        _judge(
+            steps, progress, last_progress, moved_m, off_track, self.limits, *self.counters, _CODES, status
+        )
         return status
+
+
+@compiled
+def _judge(  # type: ignore[no-untyped-def]
+    steps, progress, last_progress, moved_m, off_track, limits, still, falling, codes, status
+):
+    for car in range(len(steps)):
+        status[car], still[car], falling[car] = _judge_car(
+            steps[car],
+            progress[car],
+            last_progress[car],
+            moved_m[car],
+            off_track[car],
+            limits,
+            still[car],
+            falling[car],
+            codes,
+        )
+
+
+@compiled
+def _judge_car(  # type: ignore[no-untyped-def]
+    step, progress, last_progress, moved_m, off_track, limits, still, falling, codes
+):
+    """Return a car's status code, and for how many steps it has now stood and driven backwards.
+
+    Args: see `EpisodeRules`; `codes` are `_CODES`.
+    """
+    max_steps, immobilized_steps, immobilized_m, reversed_steps = limits
+    prepare, in_progress, reverse, immobilized, off, lap_complete, time_up = codes
+    if step <= 1:
+        return prepare, 0, 0
+    still = still + 1 if moved_m <= immobilized_m else 0
+    falling = falling + 1 if progress < last_progress else 0
+    if max_steps and step >= max_steps:
+        status = time_up
+    elif progress >= 100.0:
+        status = lap_complete
+    elif off_track:
+        status = off
+    elif immobilized_steps and still >= immobilized_steps:
+        status = immobilized
+    elif reversed_steps and falling >= reversed_steps:
+        status = reverse
+    else:
+        status = in_progress
+    return status, still, falling
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +240,7 @@ class RaceRules:
         self._driven = np.zeros((n_cars, len(self._turns)), np.int64)
         self._period_s = setup.car.control_period_s
         self._front_point_m = setup.car.front_point_m
-        self._wheels_m = setup.car.wheel_points_m
+        self._wheels_m = np.array(setup.car.wheel_points_m, np.float64)
         self._episodes = setup.episode
         self._episode_rules = EpisodeRules(setup.episode, n_cars)
         self._everyone = np.arange(n_cars)
@@ -209,24 +278,29 @@ class RaceRules:
                 alternates, it does so with each episode that the car begins there.
         """
         ids = self._everyone if ids is None else ids
-        self.episode[ids] += 1
-        episode = self.episode[ids]
         if course is not None:
             self.course[ids] = course
-        courses = self.course[ids]
-        track_index = self.track_index[ids] = (
-            self._first_track[courses] + self._driven[ids, courses] % self._turns[courses]
+        pose = _begin(
+            ids,
+            self.cars,
+            self.course,
+            _NOWHERE if start_ndist is None else np.asarray(start_ndist, np.float64),
+            self._episodes.start_offset,
+            self._episodes.start_advance,
+            self._first_track,
+            self._turns,
+            self.tracks.lines[0],
+            self.tracks.closed,
+            self.episode,
+            self._driven,
+            self.track_index,
+            self.start_ndist,
+            self.steps,
+            self._previous,
+            self._last_progress,
+            *self._episode_rules.counters,
         )
-        self._driven[ids, courses] += 1
-        if start_ndist is None:
-            # An open course is driven from its start: from anywhere else it could not be completed.
-            turns = np.where(self.tracks.closed[track_index], self.cars[ids] + episode, 0)
-            start_ndist = np.mod(self._episodes.start_offset + self._episodes.start_advance * turns, 1.0)
-        self.start_ndist[ids] = start_ndist
-        for counter in (self.steps, self._previous, self._last_progress):
-            counter[ids] = 0
-        self._episode_rules.reset(ids)
-        return self.tracks.start_pose(self.start_ndist[ids], track_index)
+        return Pose(*pose)
 
     def put_back(self, ids: Ids, percent: np.ndarray) -> Pose:
         """Continue the cars' episodes from another place and return where their chassis origins are put.
@@ -279,39 +353,38 @@ class RaceRules:
 
     def apply(self) -> StepResult:
         """Apply the rules to the measured poses: one control step of every car."""
-        self.steps += 1
-        self.clock_steps += 1
         now = self.now
-        percent, self._previous = lap_progress(now.ndist, self.start_ndist, self._previous)
-        wheels_on = wheels_on_road(
-            self.tracks, self.track_index, now.x_m, now.y_m, now.yaw_rad, self._wheels_m
-        )
-        off_track: Bools = np.asarray(~wheels_on.any(axis=1))
-        moved_m = np.hypot(*(now.front - self._last_front).T)
-        status = self._episode_rules.apply(self.steps, percent, self._last_progress, moved_m, off_track)
-        previous = np.where(self.steps > 2, self._last_progress, percent)
-        # `reset` writes zeros into what is kept here; a StepResult must not change.
-        self._last_progress, self._last_front = percent.copy(), now.front
-        terminated, truncated = self.ends(status)
         return StepResult(
-            now=now,
-            running=self.steps > 1,
-            progress=percent,
-            previous_progress=previous,
-            all_wheels_on_track=np.asarray(wheels_on.all(axis=1)),
-            off_track=off_track,
-            status=status,
-            terminated=terminated,
-            truncated=truncated,
+            now,
+            *_step(
+                now.x_m,
+                now.y_m,
+                now.yaw_rad,
+                now.front,
+                now.ndist,
+                self.track_index,
+                self.tracks.closed,
+                self.tracks.road,
+                self._wheels_m,
+                self.start_ndist,
+                self._episode_rules.limits,
+                self._episodes.lap_terminates,
+                _CODES,
+                _ENDINGS,
+                self.steps,
+                self.clock_steps,
+                self._previous,
+                self._last_progress,
+                self._last_front,
+                *self._episode_rules.counters,
+            ),
         )
 
     def ends(self, status: NDArray[np.int64]) -> tuple[Bools, Bools]:
         """Return which status codes of all cars, (N,), terminate their episodes, and which cut them off, (N,) each."""
-        truncated = status == STATUS_CODE["time_up"]
-        if not self._episodes.lap_terminates:
-            truncated |= (status == STATUS_CODE["lap_complete"]) & self.tracks.closed[self.track_index]
-        going = (status <= STATUS_CODE["in_progress"]) | (status == STATUS_CODE["pause"])
-        return ~going & ~truncated, truncated
+        lap_terminates, closed = self._episodes.lap_terminates, self.tracks.closed
+        terminated, truncated = _ends(status, self.track_index, closed, lap_terminates, _ENDINGS)
+        return terminated, truncated
 
     def rest(self, ids: Ids) -> None:
         """Forget how long the cars `ids` have stood or driven backwards."""
@@ -343,10 +416,8 @@ class RaceRules:
 
     def nearer_waypoint(self) -> np.ndarray:
         """Return the nearer of the two closest waypoints, the one behind where they are equally far, (N,)."""
-        closest = self.now.closest_waypoints
-        away = self.tracks.waypoints(closest, self.track_index) - self.now.front[:, None]
-        behind_m, ahead_m = np.hypot(away[..., 0], away[..., 1]).T
-        return np.where(ahead_m < behind_m, closest[:, 1], closest[:, 0])
+        now, (waypoints, first) = self.now, self.tracks.waypoints
+        return np.asarray(_nearer(now.closest_waypoints, now.front, waypoints, first, self.track_index))
 
 
 def wheels_on_road(
@@ -356,15 +427,160 @@ def wheels_on_road(
 
     Args:
         tracks: the courses.
-        track_index: index of each car's track in them, (N,).
+        track_index: index in them of each car's track, (N,), or of that of all, (1,).
         x_m: where the cars are, (N,).
         y_m: likewise.
         yaw_rad: headings, (N,).
         wheels_m: wheels ahead and to the left of there, (4, 2).
     """
-    cos, sin = np.cos(yaw_rad)[:, None], np.sin(yaw_rad)[:, None]
-    ahead, left = np.asarray(wheels_m).T
-    points = np.stack(
-        [x_m[:, None] + cos * ahead - sin * left, y_m[:, None] + sin * ahead + cos * left], axis=-1
-    )
-    return tracks.on_road(points.reshape(-1, 2), track_index).reshape(len(points), -1)
+    wheels_m = np.asarray(wheels_m, np.float64)
+    poses = (np.ascontiguousarray(values, np.float64) for values in (x_m, y_m, yaw_rad))
+    return np.asarray(_wheels(tracks.road, track_index, *poses, wheels_m))
+
+
+@compiled
+def _wheels(road, track_index, x_m, y_m, yaw_rad, wheels_m):  # type: ignore[no-untyped-def]
+    on = np.empty((len(x_m), len(wheels_m)), np.bool_)
+    for car in range(len(x_m)):
+        line = track_index[car if len(track_index) > 1 else 0]
+        _wheels_of(road, line, x_m[car], y_m[car], yaw_rad[car], wheels_m, on[car])
+    return on
+
+
+@compiled
+def _wheels_of(road, line, x_m, y_m, yaw_rad, wheels_m, on):  # type: ignore[no-untyped-def]
+    """Write which wheels of a car are on the road, (4,)."""
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    for wheel in range(len(wheels_m)):
+        ahead, left = wheels_m[wheel, 0], wheels_m[wheel, 1]
+        on[wheel] = is_on_road(road, line, x_m + cos * ahead - sin * left, y_m + sin * ahead + cos * left)
+
+
+@compiled
+def _begin(  # type: ignore[no-untyped-def]
+    ids,
+    cars,
+    course,
+    begins,
+    start_offset,
+    start_advance,
+    first_track,
+    turns,
+    center,
+    closed,
+    episode,
+    driven,
+    track_index,
+    start_ndist,
+    steps,
+    previous,
+    last_progress,
+    still,
+    falling,
+):
+    """Begin an episode with each of the cars `ids` and return its start pose; see `RaceRules.reset`.
+
+    Arrays from `episode` on are changed in place. `begins` has no entry where the start advances.
+    """
+    x, y, yaw_rad = np.empty(len(ids)), np.empty(len(ids)), np.empty(len(ids))
+    for i in range(len(ids)):
+        car = ids[i]
+        episode[car] += 1
+        where = course[car]
+        line = track_index[car] = first_track[where] + driven[car, where] % turns[where]
+        driven[car, where] += 1
+        if len(begins):
+            start_ndist[car] = begins[i]
+        else:
+            # An open course is driven from its start: from anywhere else it could not be completed.
+            advanced = cars[car] + episode[car] if closed[line] else 0
+            start_ndist[car] = (start_offset + start_advance * advanced) % 1.0
+        steps[car] = still[car] = falling[car] = 0
+        previous[car] = last_progress[car] = 0.0
+        x[i], y[i], yaw_rad[i] = pose_at(center, closed[line], line, start_ndist[car])
+    return x, y, yaw_rad
+
+
+@compiled
+def _step(  # type: ignore[no-untyped-def]
+    x_m,
+    y_m,
+    yaw_rad,
+    front,
+    ndist,
+    track_index,
+    closed,
+    road,
+    wheels_m,
+    start_ndist,
+    limits,
+    lap_terminates,
+    codes,
+    endings,
+    steps,
+    clock_steps,
+    previous,
+    last_progress,
+    last_front,
+    still,
+    falling,
+):
+    """Apply the rules to one control step of every car and return the arrays of `StepResult` from `running` on.
+
+    Arrays from `steps` on are changed in place.
+    """
+    cars = len(x_m)
+    running, percent, before = np.empty(cars, np.bool_), np.empty(cars), np.empty(cars)
+    all_on, off_track = np.empty(cars, np.bool_), np.empty(cars, np.bool_)
+    status, wheels_on = np.empty(cars, np.int64), np.empty(len(wheels_m), np.bool_)
+    for car in range(cars):
+        steps[car] += 1
+        clock_steps[car] += 1
+        running[car] = steps[car] > 1
+        percent[car], previous[car] = lap_progress(ndist[car], start_ndist[car], previous[car])
+        _wheels_of(road, track_index[car], x_m[car], y_m[car], yaw_rad[car], wheels_m, wheels_on)
+        all_on[car], off_track[car] = wheels_on.all(), not wheels_on.any()
+        x, y = front[car, 0], front[car, 1]
+        status[car], still[car], falling[car] = _judge_car(
+            steps[car],
+            percent[car],
+            last_progress[car],
+            math.hypot(x - last_front[car, 0], y - last_front[car, 1]),
+            off_track[car],
+            limits,
+            still[car],
+            falling[car],
+            codes,
+        )
+        before[car] = last_progress[car] if steps[car] > 2 else percent[car]
+        last_progress[car], last_front[car, 0], last_front[car, 1] = percent[car], x, y
+    terminated, truncated = _ends(status, track_index, closed, lap_terminates, endings)
+    return running, percent, before, all_on, off_track, status, terminated, truncated
+
+
+@compiled
+def _ends(status, track_index, closed, lap_terminates, endings):  # type: ignore[no-untyped-def]
+    """Return which statuses terminate episodes, and which cut them off, (N,) each; `endings` are `_ENDINGS`."""
+    in_progress, pause, lap_complete, time_up = endings
+    terminated, truncated = np.empty(len(status), np.bool_), np.empty(len(status), np.bool_)
+    for car in range(len(status)):
+        code = status[car]
+        cut = code == time_up
+        if not lap_terminates:
+            cut |= code == lap_complete and closed[track_index[car]]
+        truncated[car] = cut
+        terminated[car] = not (cut or code <= in_progress or code == pause)
+    return terminated, truncated
+
+
+@compiled
+def _nearer(closest, front, waypoints, first, track_index):  # type: ignore[no-untyped-def]
+    """Return the nearer of two waypoints for each car, see `RaceRules.nearer_waypoint`."""
+    nearer = np.empty(len(front), np.int64)
+    for car in range(len(front)):
+        behind, ahead = closest[car, 0], closest[car, 1]
+        at, x, y = first[track_index[car]], front[car, 0], front[car, 1]
+        behind_m = math.hypot(waypoints[at + behind, 0] - x, waypoints[at + behind, 1] - y)
+        ahead_m = math.hypot(waypoints[at + ahead, 0] - x, waypoints[at + ahead, 1] - y)
+        nearer[car] = ahead if ahead_m < behind_m else behind
+    return nearer

@@ -264,6 +264,7 @@ class Tracks:
         clockwise: whether each course is driven clockwise, (W,), bool.
         lines: the centre lines, the inner and the outer borders, for compiled code.
         road: the roads, for compiled code.
+        waypoints: those of all courses, (P, 2), and where each course's begin among them, (W,).
     """
 
     def __init__(self, tracks: Sequence[Track]):
@@ -271,8 +272,10 @@ class Tracks:
         self.length_m = np.array([track.length_m for track in tracks])
         self.closed = np.array([track.closed for track in tracks])
         self.clockwise = np.array([track.is_clockwise for track in tracks])
-        self._waypoints = np.concatenate([track.waypoints for track in tracks])
-        self._waypoint_at = np.cumsum([0, *(len(track.waypoints) for track in tracks[:-1])])
+        self.waypoints = (
+            np.concatenate([track.waypoints for track in tracks]),
+            np.cumsum([0, *(len(track.waypoints) for track in tracks[:-1])]),
+        )
         self.lines = (
             segments.join_segments([track._center_line for track in tracks]),
             segments.join_segments([track._inner_line for track in tracks]),
@@ -308,10 +311,6 @@ class Tracks:
         ndist = np.asarray(ndist, np.float64)
         pose = segments.poses_at(self.lines[0], self.closed, track_index, ndist.ravel())
         return Pose(*(part.reshape(ndist.shape) for part in pose))
-
-    def waypoints(self, index: np.ndarray, track_index: TrackIndex) -> np.ndarray:
-        """Return the waypoints (n, k, 2) of the indices (n, k) on the courses (n,)."""
-        return self._waypoints[self._waypoint_at[track_index][:, None] + index]
 
 
 def _points(points: np.ndarray) -> np.ndarray:

@@ -16,10 +16,10 @@ FRONT_M = np.array([0.14, 0.0])
 
 
 def drive(ndist: list[float], start: float) -> Iterator[float]:
-    previous = np.zeros(1)
+    previous = 0.0
     for at in ndist:
-        shown, previous = lap_progress(np.array([at]), np.array([start]), previous)
-        yield float(shown[0])
+        shown, previous = lap_progress(at, start, previous)
+        yield shown
 
 
 @given(start=st.floats(0, 0.999), steps=st.lists(st.floats(0.0001, 0.3), max_size=30))
@@ -58,10 +58,7 @@ def test_every_recorded_progress_is_reproduced(recording, published):
     start_ndist = np.round((start["at"] - start["progress"] / 100).to_numpy() * 20) / 20 % 1
     shown = np.empty(len(recording))
     previous = np.zeros(recording["episode"].max() + 1)
-    number = recording.groupby("episode").cumcount().to_numpy()
-    for step in range(number.max() + 1):
-        row = np.flatnonzero(number == step)
-        episode = recording["episode"].to_numpy()[row]
+    for row, episode in enumerate(recording["episode"]):
         shown[row], previous[episode] = lap_progress(found.ndist[row], start_ndist[row], previous[episode])
     np.testing.assert_allclose(shown, recording["progress"], rtol=0, atol=1e-11)
 
