@@ -74,9 +74,11 @@ class ContinuousActions:
     def commands(self, action: NDArray[Any]) -> Commands:
         """Clip N actions, (N, 2) floats, to -1..1 and scale them; NaN stays NaN."""
         # In float64, because float32 shares of both ends do not add up to one.
-        share = (np.clip(np.asarray(action, np.float64), -1.0, 1.0) + 1.0) * 0.5
+        # Minimum and maximum, because `np.clip` takes longer to begin than to clip a hundred numbers.
+        share = (np.minimum(np.maximum(np.asarray(action, np.float64), -1.0), 1.0) + 1.0) * 0.5
         # This form is exact at both ends; in between, rounding may leave a range of zero width.
-        scaled = np.clip(self.low * (1.0 - share) + self.high * share, self.low, self.high)
+        scaled = self.low * (1.0 - share) + self.high * share
+        scaled = np.minimum(np.maximum(scaled, self.low), self.high)
         return scaled[:, 0], scaled[:, 1]
 
 

@@ -26,10 +26,9 @@ from .rival import RaceRival
 from .rules import RaceRules, StepResult
 from .setup import RaceSetup
 from .state import Measures, checked_array
-from .trace import OTHERS_PACKED, PACKED, RANDOMIZED, RIVAL_PACKED
+from .trace import OTHERS_PACKED, PACKED, RIVAL_PACKED
+from .trace_rows import row_dtype, write_rows
 
-_RANDOMIZED = slice(PACKED[next(iter(RANDOMIZED))], PACKED[next(iter(RANDOMIZED))] + len(RANDOMIZED))
-"""The columns of `RANDOMIZED`, which are adjacent in packed rows."""
 _KEPT = (
     *("_return", "_steering_deg", "_commanded_mps"),
     *("observation", "pixels", "reward", "terminated", "truncated", "trace"),
@@ -155,6 +154,8 @@ class Race:
             extra += RIVAL_PACKED
         self.trace = np.zeros((n_cars, len(PACKED) + len(extra)))
         self.trace[:, PACKED["car"]] = self.cars
+        self._row = row_dtype(extra)
+        self._no_action = np.full(n_cars, np.nan)
         self.seed(setup.seed)
 
     @property
@@ -383,32 +384,34 @@ class Race:
     def _write_trace(
         self, result: StepResult, action: np.ndarray, steering_deg: np.ndarray, speed_mps: np.ndarray
     ) -> None:
-        rules, now, row = self.rules, result.now, self.trace
-        for name, values in (
-            ("episode", rules.episode),
-            ("steps", rules.steps),
-            ("X", now.front[:, 0]),
-            ("Y", now.front[:, 1]),
-            ("yaw", np.degrees(now.yaw_rad)),
-            ("steer", steering_deg),
-            ("throttle", speed_mps),
-            ("action", action if action.ndim == 1 else np.nan),
-            ("reward", self.reward),
-            ("done", self.terminated | self.truncated),
-            ("all_wheels_on_track", result.all_wheels_on_track),
-            ("progress", result.progress),
-            ("closest_waypoint", rules.nearer_waypoint()),
-            ("track_len", rules.length_m),
-            ("track", rules.course),
-            ("tstamp", rules.clock_steps * self._period_s),
-            ("episode_status", result.status),
-            ("speed_mps", now.speed_mps),
-            ("episode_return", self._return),
-        ):
-            row[:, PACKED[name]] = values
-        row[:, _RANDOMIZED] = self.randomization.values
+        rules, now = self.rules, result.now
+        write_rows(
+            self.trace.view(self._row)[:, 0],
+            rules.episode,
+            rules.steps,
+            now.front,
+            now.yaw_rad,
+            steering_deg,
+            speed_mps,
+            action.astype(np.float64) if action.ndim == 1 else self._no_action,
+            self.reward,
+            self.terminated,
+            self.truncated,
+            result.all_wheels_on_track,
+            result.progress,
+            rules.nearer_waypoint(),
+            rules.tracks.length_m,
+            rules.course,
+            rules.track_index,
+            rules.clock_steps,
+            self._period_s,
+            result.status,
+            now.speed_mps,
+            self._return,
+            self.randomization.values,
+        )
         if self.others is not None:
-            first = len(PACKED)
+            row, first = self.trace, len(PACKED)
             row[:, first], row[:, first + 1] = rules.episode, self.others.bots_stopped
             if row.shape[1] > first + len(OTHERS_PACKED):
                 row[:, first + len(OTHERS_PACKED) :] = self.others.others.poses[:, -1]
