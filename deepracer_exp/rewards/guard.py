@@ -1,6 +1,8 @@
 """The guard around untrusted code: a time limit, Ctrl-C, and protection of shared objects."""
 
+import _signal
 import builtins
+import operator
 import signal
 import sys
 import threading
@@ -38,8 +40,11 @@ class CtrlC(KeyboardInterrupt):
     """The user's Ctrl-C; any other KeyboardInterrupt is one that the guarded code raised."""
 
 
-_set_handler = signal.signal
+# Those below `signal`, which looks up an enumeration's member each time: ten times as long as setting a handler.
+_set_handler, _get_handler = _signal.signal, _signal.getsignal
 _set_timer: Any = getattr(signal, "setitimer", None)
+_all, _map, _is, _len = all, map, operator.is_, len
+"""Built-ins to compare built-ins with: by then they may be replaced."""
 _inside: set[int] = set()
 """Threads that are in a guarded block."""
 
@@ -96,7 +101,7 @@ class Guard:
         self.restart()
         if self._has_signals:
             # Only a handler in Python can raise an exception.
-            self._sigint = signal.getsignal(signal.SIGINT)
+            self._sigint = _get_handler(signal.SIGINT)
             if callable(self._sigint):
                 _set_handler(signal.SIGINT, self._on_ctrl_c)
             self._sigalrm = _set_handler(signal.SIGALRM, self._on_alarm)
@@ -172,10 +177,12 @@ class Guard:
         """Restore what was replaced; return a message about it, or an empty string."""
         # Until built-ins are restored, none may be used: it may be a replaced one.
         names, before = builtins.__dict__, self._builtins
-        replaced = [
-            f"builtins.{name}" for name in before if name not in names or names[name] is not before[name]
-        ]
-        names.update(before)
+        replaced = []
+        if _len(names) != _len(before) or not _all(_map(_is, names.values(), before.values())):
+            replaced = [
+                f"builtins.{name}" for name in before if name not in names or names[name] is not before[name]
+            ]
+            names.update(before)
         for name, stream in self._streams.items():
             if getattr(sys, name, None) is not stream:
                 replaced.append(f"sys.{name}")

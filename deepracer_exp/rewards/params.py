@@ -1,6 +1,6 @@
 """The params dict that a reward function gets, as AWS DeepRacer defines it."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -62,15 +62,24 @@ class TrackParams(NamedTuple):
         return cls([(x, y) for x, y in track.waypoints.tolist()], track.length_m, track.reversed)
 
 
-def select(columns: Mapping[str, np.ndarray], cars: NDArray[np.intp] | None) -> dict[str, np.ndarray]:
-    """Return the columns of the given cars (None: all), each as a copy of its documented type."""
+def select(
+    columns: Mapping[str, np.ndarray],
+    cars: NDArray[np.intp] | None,
+    wanted: Collection[str] | None = None,
+) -> dict[str, np.ndarray]:
+    """Return the columns of the given cars (None: all), each as a copy of its documented type.
+
+    `wanted` are the keys of the columns (None: all that there are); `x`, which every reward has, is always among them.
+    """
     chosen: dict[str, np.ndarray] = {}
     for key in BATCH_COLUMNS:
-        column = columns[key]
-        chosen[key] = np.array(column if cars is None else column[cars], dtype=_DTYPES.get(key, np.float64))
+        if wanted is None or key in wanted or key == "x":
+            column, dtype = columns[key], _DTYPES.get(key, np.float64)
+            chosen[key] = np.array(column, dtype) if cars is None else column[cars].astype(dtype, copy=False)
     if MASK in columns:
         for key in (*object_keys(columns), MASK):
-            chosen[key] = columns[key].copy() if cars is None else columns[key][cars]
+            if wanted is None or key in wanted:
+                chosen[key] = columns[key].copy() if cars is None else columns[key][cars]
     return chosen
 
 
@@ -120,37 +129,42 @@ def scalar_params(row: Row, road: TrackParams, keys: tuple[str, ...] = COLUMNS) 
 
 
 def batch_params(
-    selected: Mapping[str, np.ndarray], road: TrackParams, waypoints: np.ndarray
+    selected: Mapping[str, np.ndarray],
+    road: TrackParams,
+    waypoints: np.ndarray,
+    wanted: Collection[str] | None = None,
 ) -> dict[str, Any]:
     """Build the same 27 keys, `previous_progress` and `objects_mask` for n cars at once, for `reward_batch`.
 
     Arrays about K others have a column for each of them, none where the cars are alone.
 
     Args:
-        selected: Columns of `select`, shape (n,), `closest_waypoints` (n, 2); copied.
+        selected: Columns of `select`, shape (n,), `closest_waypoints` (n, 2).
         road: The keys that are constant on the course.
         waypoints: Those of the course as an array, (W, 2); copied.
+        wanted: The keys to build besides those of `selected`; None: all.
     """
-    params = {
-        **{key: column.copy() for key, column in selected.items()},
-        "track_length": road.track_length,
-        "waypoints": waypoints.copy(),
-        "is_reversed": road.is_reversed,
-    }
-    return params if MASK in params else {**params, **_no_others(len(selected["x"]))}
+    n = len(selected["x"])
+    params: dict[str, Any] = dict(selected)
+    params["track_length"], params["is_reversed"] = road.track_length, road.is_reversed
+    if wanted is None or "waypoints" in wanted:
+        params["waypoints"] = waypoints.copy()
+    for key, (shape, dtype) in _ALONE.items():
+        if key not in params and (wanted is None or key in wanted):
+            params[key] = np.zeros((n, *shape), dtype)
+    return params
 
 
-def _no_others(n: int) -> dict[str, np.ndarray]:
-    """Return the columns about others for n cars that are alone."""
-    return {
-        "is_crashed": np.zeros(n, bool),
-        "closest_objects": np.zeros((n, 2), np.int64),
-        "objects_location": np.zeros((n, 0, 2)),
-        "objects_left_of_center": np.zeros((n, 0), bool),
-        "object_in_camera": np.zeros(n, bool),
-        "objects_speed": np.zeros((n, 0)),
-        "objects_heading": np.zeros((n, 0)),
-        "objects_distance_from_center": np.zeros((n, 0)),
-        "objects_distance": np.zeros((n, 0)),
-        MASK: np.zeros((n, 0), bool),
-    }
+_ALONE: dict[str, tuple[tuple[int, ...], type]] = {
+    "is_crashed": ((), np.bool_),
+    "closest_objects": ((2,), np.int64),
+    "objects_location": ((0, 2), np.float64),
+    "objects_left_of_center": ((0,), np.bool_),
+    "object_in_camera": ((), np.bool_),
+    "objects_speed": ((0,), np.float64),
+    "objects_heading": ((0,), np.float64),
+    "objects_distance_from_center": ((0,), np.float64),
+    "objects_distance": ((0,), np.float64),
+    MASK: ((0,), np.bool_),
+}
+"""Shape for each car and type of the columns about others where a car is alone."""

@@ -4,7 +4,7 @@ import itertools
 import math
 import reprlib
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from types import CodeType
 from typing import Any, NoReturn
 
@@ -101,8 +101,8 @@ class RewardFunction:
             what, cause = what_happened(error, source.path, time_limit_s)
             how = "" if isinstance(error, Unusable) else "cannot be run: "
             raise BadInput(source.path, f"{how}{what}") from cause
-        read = keys_read(source_with_constants(source), name)
-        self.object_keys = tuple(key for key in OBJECT_COLUMNS if read is None or key in read)
+        self._read = keys_read(source_with_constants(source), name)
+        self.object_keys = tuple(key for key in OBJECT_COLUMNS if self._read is None or key in self._read)
         self._track_params: Sequence[TrackParams] = ()
         self._waypoints: list[np.ndarray] = []
 
@@ -136,7 +136,7 @@ class RewardFunction:
                 order = np.argsort(track_of, kind="stable")
                 cars, track_of = cars[order], track_of[order]
             call = self._call_batch if self.is_batch else self._call_each
-            rewards[cars] = call(select(columns, cars), track_params, track_of, cars.tolist())
+            rewards[cars] = call(columns, track_params, track_of, cars)
         return rewards
 
     def compute(self, params: dict[str, Any]) -> float:
@@ -170,12 +170,12 @@ class RewardFunction:
 
     def _call_each(
         self,
-        selected: dict[str, np.ndarray],
+        columns: Mapping[str, np.ndarray],
         track_params: Sequence[TrackParams],
         track_of: NDArray[np.intp],
-        cars: list[int],
+        ids: NDArray[np.intp],
     ) -> list[float]:
-        functions = self.functions
+        functions, cars, selected = self.functions, ids.tolist(), select(columns, ids)
         rewards: list[float] = []
         table, own_params = list(rows(selected)), [track_params[place] for place in track_of.tolist()]
         keys = row_keys(selected)
@@ -197,37 +197,41 @@ class RewardFunction:
 
     def _call_batch(
         self,
-        selected: dict[str, np.ndarray],
+        columns: Mapping[str, np.ndarray],
         track_params: Sequence[TrackParams],
         track_of: NDArray[np.intp],
-        cars: list[int],
+        ids: NDArray[np.intp],
     ) -> NDArray[np.float64]:
-        """Call the function once per course; the cars of a course are adjacent."""
+        """Call the function once per course; the cars of a course are adjacent. It gets the keys that it may read."""
         if track_params is not self._track_params:
             self._track_params = track_params
             self._waypoints = [np.array(road.waypoints, dtype=float).reshape(-1, 2) for road in track_params]
-        rewards = np.empty(len(cars))
-        bounds = [0, *(np.flatnonzero(np.diff(track_of)) + 1).tolist(), len(cars)]
+        rewards = np.empty(len(ids))
+        bounds = [0, len(ids)]
+        if len(track_params) > 1:
+            bounds[1:1] = (np.flatnonzero(np.diff(track_of)) + 1).tolist()
 
-        def params(first: int, last: int) -> dict[str, Any]:
-            part = {key: column[first:last] for key, column in selected.items()}
-            place = track_of[first]
-            return batch_params(part, track_params[place], self._waypoints[place])
+        def params(first: int, last: int, wanted: Collection[str] | None = None) -> dict[str, Any]:
+            selected, place = select(columns, ids[first:last], wanted), track_of[first]
+            return batch_params(selected, track_params[place], self._waypoints[place], wanted)
 
-        ends = (0, len(cars))
+        ends = (0, len(ids))
         try:
             with Guard(self.time_limit_s):
                 for ends in itertools.pairwise(bounds):
-                    rewards[slice(*ends)] = _as_rewards(self.functions[0](params(*ends)), ends[1] - ends[0])
+                    returned = self.functions[0](params(*ends, self._read))
+                    rewards[slice(*ends)] = _as_rewards(returned, ends[1] - ends[0])
         except CtrlC:
             raise
         except BaseException as error:  # noqa: BLE001 - raised again as one of ours
             self._fail(error, None, params(*ends))
-        bad = np.flatnonzero(~(np.abs(rewards) <= MAX_REWARD))
-        if len(bad):
-            row, road = list(rows(selected))[bad[0]], track_params[track_of[bad[0]]]
-            no_reward = Unusable(_no_reward(float(rewards[bad[0]])))
-            self._fail(no_reward, cars[bad[0]], scalar_params(row, road, row_keys(selected)))
+        accepted = np.abs(rewards) <= MAX_REWARD
+        if not accepted.all():
+            bad = int(accepted.argmin())
+            selected, road = select(columns, ids[bad : bad + 1]), track_params[track_of[bad]]
+            no_reward = Unusable(_no_reward(float(rewards[bad])))
+            row = next(iter(rows(selected)))
+            self._fail(no_reward, int(ids[bad]), scalar_params(row, road, row_keys(selected)))
         return rewards
 
     def _fail(self, error: BaseException, car: int | None, params: dict[str, Any]) -> NoReturn:
