@@ -1,7 +1,11 @@
 """Actions that depend on the car and not on the process it drives in."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
-from tensordict import TensorDictBase
+from numpy.typing import NDArray
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.distributions import Categorical, Distribution, Independent
@@ -29,17 +33,19 @@ class SamplingPolicy(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Add action and log-probability."""
-        noise = tensordict.get(NOISE)
-        if self._compiled is not None:
-            drawn = self._compiled.sample(tensordict.get("observation").numpy(), noise.numpy())
-            action, log_prob = map(torch.from_numpy, drawn)
-        else:
-            # Apart, since a trunk's output is left there, too.
-            acted = tensordict.select(*self.policy.in_keys)
-            action, log_prob = _drawn(self.policy.get_dist(acted), noise)
-        tensordict.set("action", action)
-        tensordict.set("action_log_prob", log_prob)
+        for key, values in self.act({key: tensordict.get(key).numpy() for key in self.in_keys}).items():
+            tensordict.set(key, torch.from_numpy(values))
         return tensordict
+
+    def act(self, seen: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        """Return `action` and `action_log_prob` of N cars for what they see, (N, ...) by key."""
+        if self._compiled is not None:
+            action, log_prob = self._compiled.sample(seen["observation"], seen[NOISE])
+            return {"action": action, "action_log_prob": log_prob}
+        noise = torch.from_numpy(seen[NOISE])
+        read = {key: torch.from_numpy(seen[key]) for key in self.policy.in_keys}
+        drawn = _drawn(self.policy.get_dist(TensorDict(read, [len(noise)])), noise)
+        return dict(zip(self.out_keys, (values.detach().numpy() for values in drawn), strict=True))
 
 
 def _drawn(distribution: Distribution, noise: Tensor) -> tuple[Tensor, Tensor]:

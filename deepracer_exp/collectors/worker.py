@@ -13,6 +13,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.data import Unbounded
+from torchrl.envs.utils import set_exploration_type
 
 from deepracer_exp.env.head_to_head import HeadToHead, Rivals, Weights
 from deepracer_exp.env.race import Race
@@ -29,9 +30,9 @@ from .sampling import NOISE
 
 
 class CarCollector(Collector):
-    """TorchRL's collector without what nothing here reads: numbers of trajectories, and moves to another device.
+    """TorchRL's collector of a `RaceEnv`, driven by a `SamplingPolicy` of this process.
 
-    They take a tenth of a control step.
+    It leaves out what nothing here reads: numbers of trajectories, and moves to another device.
     """
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
@@ -39,8 +40,27 @@ class CarCollector(Collector):
         super().__init__(*arguments, **options)
         self.storing_device = None
 
-    def _update_traj_ids(self, env_output: TensorDictBase) -> None:
-        pass
+    @torch.no_grad()
+    def rollout(self) -> TensorDictBase:
+        """Drive a batch and return it, [N, T], valid until the next one.
+
+        Each step is written where it belongs in the batch. The base class makes a TensorDict of each and stacks them in
+        the end, which takes a seventh of the time.
+        """
+        batch, env, policy = self._final_rollout, self.env, self._wrapped_policy
+        names = [key for key in batch.keys(True, True) if key[0] != "collector"]
+        columns = {key: batch.get(key).numpy() for key in names}
+        with set_exploration_type(self.exploration_type):
+            for step in range(self.frames_per_batch):
+                seen = env.seen
+                acted = policy.act(seen)
+                following = env.drive(acted["action"])
+                for key, values in (*seen.items(), *acted.items()):
+                    columns[key][:, step] = values
+                for key, values in following.items():
+                    columns["next", key][:, step] = values
+                env.begin_again(following["done"])
+        return batch
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,19 +157,22 @@ class _StateKeepingEnv(RaceEnv):
         assert self._rivals is not None
         self.race.drive_with(self._rivals.policies(weights))
 
-    def _draw(self) -> None:
-        # A copy: the next block of numbers is written over this one.
-        self._drawn = torch.from_numpy(self._noise.normal().copy())
+    @property
+    def seen(self) -> dict[str, np.ndarray]:
+        """What policies may read now, by key."""
+        return {**super().seen, NOISE: self._drawn}
 
-    def _seen(self) -> dict[str, torch.Tensor]:
-        return {**super()._seen(), NOISE: self._drawn}
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def drive(self, action: np.ndarray) -> dict[str, np.ndarray]:
+        """Step all cars, with new numbers for their next actions; see `RaceEnv.drive`."""
         self._draw()
         try:
-            return super()._step(tensordict)
+            return super().drive(action)
         except RunFailed as error:
             if not hasattr(error, "arrays"):
                 error.arrays = self.race.state_arrays()  # type: ignore[attr-defined]
             self._on_failure(error)
             raise
+
+    def _draw(self) -> None:
+        # A copy: the next block of numbers is written over this one.
+        self._drawn = self._noise.normal().copy()

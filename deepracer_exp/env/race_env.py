@@ -57,6 +57,35 @@ class RaceEnv(EnvBase):
         self.full_done_spec = Composite(flags, shape=(n_cars,))
         self._no = torch.zeros(n_cars, 1, dtype=torch.bool)
 
+    @property
+    def seen(self) -> dict[str, np.ndarray]:
+        """What policies may read now, by key."""
+        return self.race.seen
+
+    def drive(self, action: np.ndarray) -> dict[str, np.ndarray]:
+        """Step all cars and return what a step has under `next`, by key; `trace` is valid until the next step.
+
+        Actions are as for `Race.step`, which also says what is raised.
+        """
+        race = self.race
+        race.step(action)
+        if self._on_step is not None:
+            self._on_step()
+        terminated, truncated = race.terminated[:, None], race.truncated[:, None]
+        return {
+            **self.seen,
+            "reward": race.reward.astype(np.float32)[:, None],
+            "trace": race.trace,
+            "done": terminated | truncated,
+            "terminated": terminated,
+            "truncated": truncated,
+        }
+
+    def begin_again(self, done: np.ndarray) -> None:
+        """Start new episodes with the cars whose episodes ended, (N, 1)."""
+        if done.any():
+            self.race.reset(np.flatnonzero(done))
+
     def step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         """Step, and start new episodes where one ended, as the base class does but faster.
 
@@ -64,9 +93,7 @@ class RaceEnv(EnvBase):
         """
         following = self._step(tensordict)
         tensordict.set("next", following)
-        done = following.get("done")
-        if done.any():
-            self.race.reset(np.flatnonzero(done.numpy()))
+        self.begin_again(following.get("done").numpy())
         return tensordict, self._begun()
 
     def resume_from(self, state: Mapping[str, Any]) -> None:
@@ -91,32 +118,14 @@ class RaceEnv(EnvBase):
     def _begun(self) -> TensorDict:
         """Return the observations, with all flags of the end of an episode False."""
         flags = {key: self._no.clone() for key in _FLAGS}
-        return TensorDict._new_unsafe(
-            {**self._seen(), **flags}, batch_size=self.batch_size, device=self.device
-        )
+        seen = {key: torch.from_numpy(values) for key, values in self.seen.items()}
+        return TensorDict._new_unsafe({**seen, **flags}, batch_size=self.batch_size, device=self.device)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        race = self.race
-        race.step(tensordict.get("action").detach().numpy())
-        if self._on_step is not None:
-            self._on_step()
-        terminated = torch.from_numpy(race.terminated)[:, None]
-        truncated = torch.from_numpy(race.truncated)[:, None]
-        return TensorDict._new_unsafe(
-            {
-                **self._seen(),
-                "reward": torch.from_numpy(race.reward.astype(np.float32))[:, None],
-                "trace": torch.from_numpy(race.trace.copy()),
-                "done": terminated | truncated,
-                "terminated": terminated,
-                "truncated": truncated,
-            },
-            batch_size=self.batch_size,
-            device=self.device,
-        )
-
-    def _seen(self) -> dict[str, torch.Tensor]:
-        return {key: torch.from_numpy(values) for key, values in self.race.seen.items()}
+        following = self.drive(tensordict.get("action").detach().numpy())
+        following["trace"] = following["trace"].copy()
+        tensors = {key: torch.from_numpy(values) for key, values in following.items()}
+        return TensorDict._new_unsafe(tensors, batch_size=self.batch_size, device=self.device)
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
