@@ -1,6 +1,6 @@
 """The guard around untrusted code: a time limit, Ctrl-C, and protection of shared objects."""
 
-import _signal
+import _signal  # type: ignore[import-not-found]
 import builtins
 import operator
 import signal
