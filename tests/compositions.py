@@ -1,7 +1,7 @@
-"""Hydra composes the same choices of the project's own options once for all tests: it was a quarter of their time.
+"""Hydra composes the same choices once for all tests of a process: it was a quarter of their time.
 
-What a user's folder adds is composed anew each time, since tests write such options; so is all that concerns sweeps,
-whose studies may lie in the working folder.
+Options of a user's `./conf` count with their contents, since tests write such files. What concerns sweeps, whose
+studies may lie in the working folder, is composed anew each time.
 """
 
 import copy
@@ -18,21 +18,30 @@ _hydra = option_files.composed
 
 
 @functools.cache
-def _once(entry: str | None, lines: tuple[str, ...]) -> tuple[DictConfig, dict[str, str]]:
+def _once(
+    entry: str | None, lines: tuple[str, ...], own: tuple[tuple[str, bytes], ...]
+) -> tuple[DictConfig, dict[str, str]]:
     return _hydra(entry, lines)
 
 
-def _is_ours(line: str) -> bool:
-    """Return whether a line chooses an option that is a file of the project, or a world."""
+def _is_file(line: str) -> bool:
+    """Return whether a line chooses an option that is a file, or a world."""
     group, _, option = line.removeprefix("+").replace("'", "").partition("=")
-    is_file = (conf_dir() / group / f"{option}.yaml").is_file()
+    is_file = any((folder / group / f"{option}.yaml").is_file() for folder in conf_dirs())
     return not group.startswith(SWEEP) and (is_file or (group == "track" and option in worlds()))
 
 
+def _own_options() -> tuple[tuple[str, bytes], ...]:
+    """Return the files of the user's options with their contents."""
+    folders = [folder for folder in conf_dirs() if folder != conf_dir().resolve()]
+    files = (path for folder in folders for path in sorted(folder.rglob("*.yaml")))
+    return tuple((str(path), path.read_bytes()) for path in files)
+
+
 def _composed(entry: str | None, lines: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
-    if entry == "sweep" or conf_dirs() != [conf_dir().resolve()] or not all(map(_is_ours, lines)):
+    if entry == "sweep" or not all(map(_is_file, lines)):
         return _hydra(entry, lines)
-    return copy.deepcopy(_once(entry, tuple(lines)))
+    return copy.deepcopy(_once(entry, tuple(lines), _own_options()))
 
 
 def compose_once() -> None:

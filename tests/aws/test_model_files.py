@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 
 from deepracer_exp.aws.models import model_metadata
@@ -27,6 +27,7 @@ from deepracer_exp.aws.models.model_metadata import (
 from deepracer_exp.errors import BadInput
 from tests.config.conftest import HYPERPARAMETERS as DRFC
 from tests.conftest import refused
+from tests.examples import examples
 
 SENSORS = ["FRONT_FACING_CAMERA", "DISCRETIZED_SECTOR_LIDAR"]
 DISCRETE = [{"steering_angle": -30, "speed": 0.6}, {"steering_angle": 30, "speed": 1.2}]
@@ -206,7 +207,7 @@ JSON = st.recursive(
 )
 
 
-@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@examples(200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(key=st.sampled_from(model_metadata.KEYS), value=JSON, continuous=st.booleans())
 def test_no_value_of_any_key_ends_in_another_error_than_bad_input(tmp_path, key, value, continuous):
     content: dict[str, Any] = {"action_space": CONTINUOUS if continuous else DISCRETE, "version": "5"}

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from deepracer_exp.aws.logs import blocks, sim_trace, text_log
@@ -13,6 +13,7 @@ from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.aws.logs.recording import Recording
 from deepracer_exp.errors import BadInput
 from tests.conftest import refused
+from tests.examples import examples
 
 from . import made_up_logs as made
 
@@ -326,7 +327,7 @@ def damaged(text: str, changes: list[tuple[float, str, str]]) -> str:
 
 @pytest.mark.parametrize("name", ["a.log", "0-iteration.csv"])
 @given(fields=st.sampled_from(GENERATIONS), changes=edits, cut=st.floats(0.1, 1))
-@settings(max_examples=150)
+@examples(150)
 def test_every_line_of_a_trace_is_read_or_listed(tmp_path_factory, name, fields, changes, cut):
     is_csv = name.endswith(".csv")
     head, _, body = made.csv_text(ROWS, fields).partition("\n")
@@ -341,7 +342,7 @@ def test_every_line_of_a_trace_is_read_or_listed(tmp_path_factory, name, fields,
 
 
 @given(raw=st.binary(max_size=2000), name=st.sampled_from(FILES))
-@settings(max_examples=150)
+@examples(150)
 def test_random_bytes_are_read_or_refused_in_one_line(tmp_path_factory, raw, name):
     folder = tmp_path_factory.mktemp("fuzz")
     head = b"\x1f\x8b\x08\0" if name.endswith("gz") else b""
@@ -351,7 +352,7 @@ def test_random_bytes_are_read_or_refused_in_one_line(tmp_path_factory, raw, nam
 
 
 @given(cut=st.floats(0, 1), changes=edits)
-@settings(max_examples=60)
+@examples(60)
 def test_a_damaged_metrics_file_is_read_or_refused(tmp_path_factory, cut, changes):
     text = damaged(made.training_metrics(ROWS), changes)
     file: Path = tmp_path_factory.mktemp("fuzz") / "TrainingMetrics.json"

@@ -30,7 +30,9 @@ main(["evaluate", str(run), "--video", "lap.mp4"])
 # the variable when it is imported.
 FORKS = """
 import json, os, sys, traceback
-import numba, scipy, shapely, torch, torchrl
+import hydra, numba, PIL, pyarrow, pydantic, requests, rich, scipy, shapely, torch
+import torchrl
+import deepracer_exp.config.compose, deepracer_exp.rewards.source, deepracer_exp.tracks.track
 assert "mujoco" not in sys.modules
 for number, (library, code) in enumerate(json.loads(sys.argv[1])):
     if child := os.fork():

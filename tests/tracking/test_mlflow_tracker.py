@@ -18,6 +18,7 @@ from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.projection import MLflowProjection
 from deepracer_exp.tracking.store import resolve_store
 from deepracer_exp.tracking.tracking_file import TrackedRun, TrackingFile
+from tests.waiting import PATIENCE_S
 
 from .conftest import begin, points, write_rows
 
@@ -178,34 +179,41 @@ def test_a_server_that_is_down_costs_no_training_and_shows_no_password(
 
 def test_two_processes_that_begin_at_once_in_a_new_folder_lose_nothing(tmp_path):
     runs = tmp_path / "meine Läufe mit ß" / "50%#"
-    code = (
-        "import json, sys; from pathlib import Path\n"
-        "from deepracer_exp.tracking.mlflow_tracker import MLflowTracker\n"
-        "from deepracer_exp.tracking.store import resolve_store\n"
-        f"tracker = MLflowTracker(resolve_store(None, Path({str(runs)!r})))\n"
-        "from deepracer_exp.tracking.tracking_file import TrackedRun\n"
-        f"folder = Path({str(tmp_path)!r}) / sys.argv[1]\n"
-        "folder.mkdir()\n"
-        "tracker.open(folder, TrackedRun('run ' + sys.argv[1], 'race', 1))\n"
-        "rows = [{'env_steps': step, 'kl': step + int(sys.argv[1]) / 8} for step in range(50)]\n"
-        "(folder / 'metrics.jsonl').write_text(''.join(json.dumps(row) + '\\n' for row in rows))\n"
-        "tracker.finish('FINISHED', 120)\n"
-        "assert tracker.failure is None\n"
-        "print(tracker.run_id)"
-    )
-    both = [
-        subprocess.Popen(
-            [sys.executable, "-c", code, str(seed)],
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        )
-        for seed in range(2)
-    ]  # fmt: skip
-    ended = [process.communicate() for process in both]
+    code = f"""
+import json, mlflow, multiprocessing
+from pathlib import Path
+from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
+from deepracer_exp.tracking.store import resolve_store
+from deepracer_exp.tracking.tracking_file import TrackedRun
+
+def record(seed, begin):
+    begin.wait({PATIENCE_S})
+    tracker = MLflowTracker(resolve_store(None, Path({str(runs)!r})))
+    folder = Path({str(tmp_path)!r}, str(seed))
+    folder.mkdir()
+    tracker.open(folder, TrackedRun(f"run {{seed}}", "race", 1))
+    rows = [{{"env_steps": step, "kl": step + seed / 8}} for step in range(50)]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\\n" for row in rows))
+    tracker.finish("FINISHED", 120)
+    assert tracker.failure is None
+    (folder / "run_id").write_text(tracker.run_id)
+
+forked = multiprocessing.get_context("fork")
+begin = forked.Barrier(2)
+both = [forked.Process(target=record, args=(seed, begin)) for seed in range(2)]
+for process in both:
+    process.start()
+for process in both:
+    process.join()
+print([process.exitcode for process in both])
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (ended.stdout, ended.stderr) == ("[0, 0]\n", "")
     client = MlflowClient(tracking_uri=resolve_store(None, runs).uri)
-    for seed, (run_id, noise) in enumerate(ended):
-        assert (both[seed].returncode, noise) == (0, "")
-        assert points(client, run_id.strip(), "kl") == [(step, step + seed / 8) for step in range(50)]
-        assert [file.path for file in client.list_artifacts(run_id.strip())] == ["metrics.jsonl"]
+    for seed in range(2):
+        run_id = (tmp_path / str(seed) / "run_id").read_text()
+        assert points(client, run_id, "kl") == [(step, step + seed / 8) for step in range(50)]
+        assert [file.path for file in client.list_artifacts(run_id)] == ["metrics.jsonl"]
     assert {path.name for path in runs.iterdir()} == {"mlflow.db", "mlflow.db.lock", "mlflow-artifacts"}
 
 
