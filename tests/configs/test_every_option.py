@@ -28,7 +28,9 @@ DRIVEN = ("track", "race", "car", "action_space", "observation", "randomization"
 @cache
 def composed(group: str, name: str) -> tuple[Experiment, Composition]:
     """Compose an option into the default experiment, a network with what it reads."""
-    reads = "features" if name.startswith("mlp") else "lidar" if name == "lidar" else "camera"
+    # Only the deepest needs pictures as large as the service's, for which the others' weights take seconds to draw.
+    reads = {"lidar": "lidar", "deep": "camera"}.get(name, "camera_small")
+    reads = "features" if name.startswith("mlp") else reads
     sees = [f"observation={reads}"] if group == "network" else []
     teacher = ["teacher=a_run"] if name == "distill" else []
     sees += ["observation.next_objects=2"] if group == "race" else []
