@@ -42,8 +42,9 @@ def histogram(values: Values, least: int = 8) -> Histogram:
         # Bins with different numbers of possible values would look like a comb.
         width = grain * max(1, round(width / grain))
         low -= grain / 2
-    edges = low + width * np.arange(int(np.ceil((high - low) / width + 1e-6)) + 1)
-    counts, _ = np.histogram(values, bins=edges)
+    bins = int(np.ceil((high - low) / width + 1e-6))
+    # Of bins of one width NumPy computes the number of a value, instead of searching it.
+    counts, edges = np.histogram(values, bins=bins, range=(low, low + width * bins))
     return Histogram((edges[1:] + edges[:-1]) / 2, counts.astype(np.float64), width)
 
 

@@ -13,7 +13,7 @@ from deepracer_exp.aws.logs.recording import TRAINING
 from deepracer_exp.env.rules import lap_clock_s
 from deepracer_exp.tracks.track import Track
 
-from .statistics import Values
+from .statistics import MOST_ROWS, Values, subsample
 
 DERIVED_COLUMNS: Mapping[str, str] = {
     "lap_clock_s": "s since the lap began, as the service counts a lap time (`rules.lap_clock_s`)",
@@ -42,8 +42,6 @@ STILL_M = 0.01
 """Movement below which a car has no direction of travel."""
 STOPPED = ("off_track", "crashed", "immobilized", "reversed")
 """Status of the rows after which a car is put back, or the episode ends."""
-_TOGETHER = 2**16
-"""Rows that are projected together."""
 FIRST_STEPS = 2
 """Highest step number of an episode's first row: formats without prepare rows may begin with 2."""
 
@@ -61,14 +59,14 @@ def add_derived(steps: pd.DataFrame, course: Track | None, discount: float) -> p
     lap_position, offset_m, center_deg = _places(steps, first, course)
     stopped = first & ~flying_rows(steps)
     derived = dict(zip(_MOVED, _moved(x, y, yaw, time_s, progress, first, stopped, center_deg), strict=True))
-    change = _change(derived["track_speed_mps"], time_s, stopped)
+    faster, slower = _change(derived["track_speed_mps"], time_s, stopped)
     derived |= {
         "lap_clock_s": _lap_clock(steps, stopped, first, derived["delta_time_s"]),
-        "acceleration_mps2": np.maximum(change, 0.0),
-        "braking_mps2": np.maximum(-change, 0.0),
+        "acceleration_mps2": faster,
+        "braking_mps2": slower,
         "lap_position": lap_position,
         "offset_m": offset_m,
-        "discounted_future_reward": _discounted(np.nan_to_num(reward), first, discount),
+        "discounted_future_reward": _discounted(reward, first, discount),
     }
     return with_columns(steps, {name: derived[name] for name in DERIVED_COLUMNS})
 
@@ -102,7 +100,7 @@ def _moved(x, y, yaw, time_s, progress, first, stopped, center_deg):  # type: ig
         if not first[i] and i > 0:
             gained, center_turned = progress[i] - progress[i - 1], _wrapped(center_deg[i] - center_deg[i - 1])
         before_x, before_y = rear_x, rear_y
-        dist = math.hypot(dx, dy)
+        dist = math.sqrt(dx * dx + dy * dy)
         passed = seconds if seconds > 0.0 else np.nan
         out[0, i], out[1, i], out[2, i], out[4, i] = seconds, dist, dist / passed, turned / passed
         if not first[i]:
@@ -112,7 +110,7 @@ def _moved(x, y, yaw, time_s, progress, first, stopped, center_deg):  # type: ig
             out[5, i] = bearing
             # Both are directions between two rows, because a centre line turns by up to 10 degrees at a waypoint.
             out[7, i] = _wrapped(bearing - (center_deg[i] - center_turned / 2))
-            if math.hypot(rear_dx, rear_dy) >= STILL_M:
+            if rear_dx * rear_dx + rear_dy * rear_dy >= STILL_M**2:
                 rear_deg = math.degrees(math.atan2(rear_dy, rear_dx))
                 out[6, i] = _wrapped(rear_deg - (yaw[i] - turned / 2))
     return out
@@ -120,6 +118,9 @@ def _moved(x, y, yaw, time_s, progress, first, stopped, center_deg):  # type: ig
 
 @njit(cache=True, nogil=True)
 def _wrapped(angle_deg):  # type: ignore[no-untyped-def]
+    # Most turns between two rows are small, and a remainder takes longer than all else here.
+    if -180.0 <= angle_deg < 180.0:
+        return angle_deg
     return (angle_deg + 180.0) % 360.0 - 180.0
 
 
@@ -128,7 +129,9 @@ def _lap_clock(
 ) -> Values:
     """Return the clock of a lap: the time before its first row was driven without a pause, the rest is recorded."""
     begin, tstamp = np.flatnonzero(first), steps["tstamp"].to_numpy(np.float64)
-    period_s = float(np.median(delta_time_s[~stopped])) if not stopped.all() else CONTROL_PERIOD_S
+    part = subsample(len(stopped), MOST_ROWS)
+    known_s = delta_time_s[part][~stopped[part]]
+    period_s = float(np.median(known_s)) if len(known_s) else CONTROL_PERIOD_S
     # The generation that counts from 0 has no prepare rows either.
     before_s = lap_clock_s(np.maximum(steps["steps"].to_numpy()[begin], 1), period_s)
     began_s = tstamp[begin] - np.where(stopped[begin], before_s, delta_time_s[begin])
@@ -168,15 +171,8 @@ def _places(
 ) -> tuple[Values, Values, Values]:
     """Return lap position, offset and the centre line's direction in degrees."""
     if course is not None:
-        x, y = (steps[name].to_numpy(np.float64) for name in ("X", "Y"))
-        lap_position, offset_m, center_deg = np.empty((3, len(steps)))
-        # In parts: memory that is touched for the first time costs more than the projection.
-        for begin in range(0, len(steps), _TOGETHER):
-            part = slice(begin, begin + _TOGETHER)
-            projected = course.project(np.column_stack([x[part], y[part]]))
-            lap_position[part], offset_m[part] = projected.ndist, projected.offset_m
-            center_deg[part] = np.degrees(projected.heading_rad)
-        return lap_position, offset_m, center_deg
+        lap_position, offset_m, center_rad = course.follow(steps["X"].to_numpy(), steps["Y"].to_numpy())
+        return lap_position, offset_m, np.degrees(center_rad, out=center_rad)
     unknown = np.full(len(steps), np.nan)
     if not len(steps):
         return unknown, unknown, unknown
@@ -185,19 +181,21 @@ def _places(
     return (start[first][np.cumsum(first) - 1] + progress / 100.0) % 1.0, unknown, unknown
 
 
-def _change(speed_mps: Values, time_s: Values, first: NDArray[np.bool_]) -> Values:
-    """Return the speed's change a second between the rows before and after; 0 where one of them is missing.
+@njit(cache=True, nogil=True, error_model="numpy")
+def _change(speed_mps, time_s, first):  # type: ignore[no-untyped-def]
+    """Return how much the speed grows and falls a second between the rows before and after, (2, n); 0 at an end.
 
     A speed is that of the time since the row before: its moment is the middle of it. Control steps last 50 to 80 ms
     in the service's traces, so that differences of neighbours would be mostly noise.
     """
-    change = np.zeros(len(speed_mps))
-    if len(change) > 3:
-        passed_s = (time_s[3:] + time_s[2:-1] - time_s[1:-2] - time_s[:-3]) / 2.0
-        with np.errstate(divide="ignore", invalid="ignore"):
-            change[2:-1] = (speed_mps[3:] - speed_mps[1:-2]) / passed_s
-        change[2:-1][first[3:] | first[2:-1] | first[1:-2]] = 0.0
-    return np.nan_to_num(change, nan=0.0, posinf=0.0, neginf=0.0)
+    out = np.zeros((2, len(speed_mps)))
+    for i in range(2, len(speed_mps) - 1):
+        if not (first[i + 1] or first[i] or first[i - 1]):
+            passed_s = (time_s[i + 1] + time_s[i] - time_s[i - 1] - time_s[i - 2]) / 2.0
+            change = (speed_mps[i + 1] - speed_mps[i - 1]) / passed_s
+            if math.isfinite(change):
+                out[0, i], out[1, i] = max(change, 0.0), max(-change, 0.0)
+    return out
 
 
 @njit(cache=True, nogil=True)
@@ -205,7 +203,7 @@ def _discounted(reward, first, discount):  # type: ignore[no-untyped-def]
     future = np.empty(len(reward))
     total = 0.0
     for i in range(len(reward) - 1, -1, -1):
-        total = reward[i] + discount * total
+        total = discount * total + (reward[i] if math.isfinite(reward[i]) else 0.0)
         future[i] = total
         if first[i]:
             total = 0.0

@@ -345,6 +345,15 @@ def project(s, track_index, points):  # type: ignore[no-untyped-def]
     return ndist, distance_m, offset_m, previous, following, center, heading_rad
 
 
+@compiled
+def follow(s, x, y):  # type: ignore[no-untyped-def]
+    """Return the rows of `Track.follow` of points (n,) and the first line, (3, n)."""
+    out = np.empty((3, len(x)))
+    for i in range(len(x)):
+        out[0, i], _, out[1, i], _, _, _, _, out[2, i] = project_point(s, 0, x[i], y[i])
+    return out
+
+
 @inlined
 def border_point(inner, outer, number, px, py, x, y, is_clockwise):  # type: ignore[no-untyped-def]
     """Return the road's width at the projection (x, y) of (px, py), and whether the point is left of its centre."""

@@ -70,9 +70,12 @@ def classify(rows: pd.DataFrame) -> ActionClasses | None:
     if continuous:
         key = _ranges(steer, speed)
         listed = np.flatnonzero(totals(np.where(logged, key, -1), None, int(key.max()) + 1))
+        place = np.zeros(int(key.max()) + 1, np.intp)
+        place[listed] = np.arange(len(listed))
+        code = np.where(logged, place[key], -1)
     else:
-        key, listed = action, np.sort(listed)
-    code = np.where(logged, np.searchsorted(listed, key), -1)
+        listed = np.sort(listed)
+        code = np.where(logged, np.searchsorted(listed, action), -1)
     groups = pd.DataFrame(
         {name: means(code, values, len(listed)) for name, values in (("steer", steer), ("speed", speed))},
         index=listed,
@@ -97,9 +100,14 @@ def classify(rows: pd.DataFrame) -> ActionClasses | None:
 
 def _ranges(steer: Values, speed: Values) -> NDArray[np.intp]:
     low, high = np.nanmin(speed), np.nanmax(speed)
-    turn = np.digitize(steer / max(np.nanmax(np.abs(steer)), 1e-9), STEERING_EDGES)
-    pace = np.digitize((speed - low) / max(high - low, 1e-9), SPEED_EDGES)
-    return turn * len(SPEED_NAMES) + pace
+    share, pace = steer / max(np.nanmax(np.abs(steer)), 1e-9), (speed - low) / max(high - low, 1e-9)
+    # Few edges are counted in less time than each value is searched among them.
+    number = np.zeros(len(steer), np.intp)
+    for edge in STEERING_EDGES:
+        number += len(SPEED_NAMES) * (share >= edge)
+    for edge in SPEED_EDGES:
+        number += pace >= edge
+    return number
 
 
 def _angle(steering_deg: float) -> str:

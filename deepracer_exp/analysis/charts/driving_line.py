@@ -103,9 +103,10 @@ def speed_steering_by_waypoint(view: LogView) -> Chart | None:
     """Draw speed and steering at each waypoint, beside those of the racing line and of the centre line."""
     columns = ("closest_waypoint", "track_speed_mps", "yaw_rate_dps", "steer", "throttle", "steps")
     rows, which = _laps_or_recent(view, *columns)
-    rows = rows[rows["steps"] > STARTING_STEPS]
-    if not len(rows):
+    started = rows["steps"].to_numpy() > STARTING_STEPS
+    if not started.any():
         return None
+    rows = pd.DataFrame({name: rows[name].to_numpy()[started] for name in columns}, copy=False)
     n = view.waypoint_count
     x, waypoint, part = np.arange(n), closest_waypoints(rows), subsample(len(rows), MOST_ROWS)
     lap = view.fastest_lap(*columns)

@@ -37,6 +37,11 @@ LAP_COLUMNS: Mapping[str, str] = {
     "iteration": ITERATION,
 }
 """Columns that lap times may correlate with, with their units."""
+_OF_STEPS = (
+    *("steer", "reward", "track_speed_mps", "progress_speed_pps", "slide_deg", "offset_m", "lap_position"),
+    "progress",
+)
+"""Columns of the steps that `LAP_COLUMNS` are computed from."""
 _SMOOTHED = 5
 """Control steps in the mean of speed and steering along a lap."""
 _ENOUGH = 20
@@ -243,15 +248,17 @@ def correlations(view: LogView) -> Chart | None:
     )
     if not len(r):
         return None
-    shown = laps.iloc[subsample(len(laps), _MOST_LAPS)]
+    shown, lap_s = laps.iloc[subsample(len(laps), _MOST_LAPS)], laps["lap_time_s"].to_numpy(np.float64)
     panels = []
     for name in r.index[:_MOST_PANELS]:
         layers: list[Layer] = [points(shown[name], shown["lap_time_s"], BLUE, size=5)]
-        rows = laps[laps[name].notna()]
+        values = laps[name].to_numpy(np.float64)
+        known, distinct = np.isfinite(values), laps[name].nunique()
+        values, times_s = values[known], lap_s[known]
         for degree, color in ((1, VERMILION), (2, ORANGE)):
-            if len(rows) >= _FITTED and rows[name].nunique() > degree + 1:
-                span = np.linspace(rows[name].quantile(0.005), rows[name].quantile(0.995), 60)
-                fit = Polynomial.fit(rows[name], rows["lap_time_s"], degree)
+            if len(values) >= _FITTED and distinct > degree + 1:
+                span = np.linspace(*np.quantile(values, [0.005, 0.995]), 60)
+                fit = Polynomial.fit(values, times_s, degree)
                 layers.append(line(span, fit(span), color, dashed=degree > 1))
         panels.append(
             Panel(
@@ -270,34 +277,32 @@ def correlations(view: LogView) -> Chart | None:
 
 def _lap_columns(view: LogView) -> pd.DataFrame:
     """Return `lap_time_s` and `LAP_COLUMNS` of each complete lap."""
-    rows = view.rows_of(view.episodes["lap_time_s"].notna().to_numpy())
-    lap = view.episode_index[rows]
-    begin = np.flatnonzero(np.diff(lap, prepend=-1))
-    count = np.diff(np.append(begin, len(lap)))
-    end, place = begin + count - 1, np.repeat(np.arange(len(begin)), count)
-    columns = ["steer", "reward", "track_speed_mps", "progress_speed_pps", "slide_deg", "offset_m"]
-    part = {
-        name: view.steps[name].to_numpy(np.float64)[rows] for name in (*columns, "lap_position", "progress")
-    }
+    wanted = view.episodes["lap_time_s"].notna().to_numpy()
+    laps, n = np.flatnonzero(wanted), len(wanted)
+    begin, end = view.begins[laps], view.begins[laps + 1] - 1
+    part = {name: view.steps[name].to_numpy(np.float64) for name in _OF_STEPS}
     changed = np.abs(np.diff(part["steer"], prepend=np.nan))
     changed[begin] = np.nan
     # The eighth row stands for half a second after the start.
-    started = np.where(count > 7, part["track_speed_mps"][np.minimum(begin + 7, end)], np.nan)
-    mean = partial(means, place, n=len(begin))
+    started = np.where(end - begin >= 7, part["track_speed_mps"][np.minimum(begin + 7, end)], np.nan)
+    # Of all episodes: to copy the rows of laps takes longer than to count the others, too.
+    mean, first = partial(means, view.episode_index, n=n), view.begins[:-1]
+    rows = view.rows_of(wanted)
+    slide_deg = np.abs(part["slide_deg"][rows])
     per_lap = pd.DataFrame(
         {
-            "speed_mean_mps": mean(part["track_speed_mps"]),
-            "speed_top_mps": np.fmax.reduceat(part["track_speed_mps"], begin),
-            "progress_top_pps": np.fmax.reduceat(part["progress_speed_pps"], begin),
-            "reward_step": mean(part["reward"]),
+            "speed_mean_mps": mean(part["track_speed_mps"])[laps],
+            "speed_top_mps": np.fmax.reduceat(part["track_speed_mps"], first)[laps],
+            "progress_top_pps": np.fmax.reduceat(part["progress_speed_pps"], first)[laps],
+            "reward_step": mean(part["reward"])[laps],
             "reward_last": part["reward"][end],
-            "steer_change_deg": mean(changed),
-            "slide_top_deg": quantiles(place, np.abs(part["slide_deg"]), len(begin), (0.95,))[0],
-            "offset_mean_m": mean(np.abs(part["offset_m"])),
+            "steer_change_deg": mean(changed)[laps],
+            "slide_top_deg": quantiles(view.episode_index[rows], slide_deg, n, (0.95,))[0][laps],
+            "offset_mean_m": mean(np.abs(part["offset_m"]))[laps],
             "start_speed_mps": started,
             "start": 100.0 * ((part["lap_position"][begin] - part["progress"][begin] / 100.0) % 1.0),
         }
-    ).set_axis(lap[begin])
+    ).set_axis(laps)
     summed = view.episodes.loc[per_lap.index, ["lap_time_s", "dist_m", "reward", "iteration"]]
     return summed.join(per_lap)[["lap_time_s", *LAP_COLUMNS]]
 
