@@ -2,7 +2,8 @@
 
 import math
 import os
-from typing import NamedTuple
+from functools import cache
+from typing import Any, NamedTuple
 
 import mujoco
 import mujoco.batch
@@ -20,9 +21,14 @@ Floats = NDArray[np.float64]
 Ids = NDArray[np.intp]
 
 
-@cfunc("float64()", cache=True)
 def _no_clock() -> float:
     return 0.0
+
+
+@cache
+def _compiled_clock() -> Any:
+    # At the first car, because commands that simulate none import this file, too.
+    return cfunc("float64()", cache=True)(_no_clock)
 
 
 class CarState(NamedTuple):
@@ -60,7 +66,7 @@ class CarBatch:
 
     def __init__(self, car: CarConfig, n_cars: int, threads: int, floor_friction: ArrayLike = 1.0) -> None:
         # MuJoCo's own clock, which each stage of a step reads for `mjData.timer`, takes a third of the step.
-        mujoco.set_mjcb_time(_no_clock.ctypes)
+        mujoco.set_mjcb_time(_compiled_clock().ctypes)
         self.car = car
         self.n_cars = n_cars
         self.model = build_spec(car).compile()

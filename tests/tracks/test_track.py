@@ -71,6 +71,13 @@ def test_the_sign_of_the_offset_is_left_of_the_driving_direction(track):
     assert not track.border_distances(middle - 0.1 * left, middle).is_left.any()
 
 
+def test_a_driven_path_is_projected_point_by_point(track, points):
+    beyond = np.vstack([points, [[np.nan, 0.0], [1e4, -1e4]]])
+    expected = track.project(beyond)
+    found = track.follow(beyond[:, 0], beyond[:, 1])
+    np.testing.assert_array_equal(found, [expected.ndist, expected.offset_m, expected.heading_rad])
+
+
 def test_width_and_side_are_measured_to_the_border_points_nearest_to_the_projection(track, points):
     center = track.project(points).center
     nearest = []

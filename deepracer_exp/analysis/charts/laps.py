@@ -257,7 +257,8 @@ def correlations(view: LogView) -> Chart | None:
         values, times_s = values[known], lap_s[known]
         for degree, color in ((1, VERMILION), (2, ORANGE)):
             if len(values) >= _FITTED and distinct > degree + 1:
-                span = np.linspace(*np.quantile(values, [0.005, 0.995]), 60)
+                low, high = np.quantile(values, [0.005, 0.995]).tolist()
+                span = np.linspace(low, high, 60)
                 fit = Polynomial.fit(values, times_s, degree)
                 layers.append(line(span, fit(span), color, dashed=degree > 1))
         panels.append(
