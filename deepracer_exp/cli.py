@@ -2,11 +2,13 @@
 """The command line; each command imports what it needs when it runs, so that `--help` and completion are fast."""
 
 import argparse
+import atexit
 import contextlib
 import os
 import select
 import signal
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable, Sequence
@@ -54,9 +56,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(_fail(error, BadInput.exit_code, args))
     if arguments is None:
         own_scratch()
-    if arguments is None and getattr(args, "runs_rewards", False):
-        sys.exit(supervised(lambda: _call(args)))
-    sys.exit(_call(args))
+    if arguments is not None:
+        sys.exit(_call(args))
+    end_process(supervised(lambda: _call(args)) if getattr(args, "runs_rewards", False) else _call(args))
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
@@ -132,6 +134,21 @@ def _call(args: argparse.Namespace) -> int:
         # The reader of our output (`| head`) has closed it; Python must not try to write the rest.
         sys.stderr.close()
         return 141
+
+
+def end_process(code: int) -> NoReturn:
+    """Exit with a code once threads and exit functions are done, without taking the modules apart.
+
+    After a training that would take up to a second, for memory that the system has back anyway.
+    """
+    threading._shutdown()  # type: ignore[attr-defined]
+    atexit._run_exitfuncs()
+    try:
+        sys.stdout.flush()
+        sys.stderr.flush()
+    except (OSError, ValueError):  # closed, or nobody reads it: Python has an answer to that
+        sys.exit(code)
+    os._exit(code)
 
 
 def _fail(error: Exception, code: int, args: argparse.Namespace) -> int:

@@ -137,6 +137,8 @@ def _fit(
             raise BadInput("algorithm", f"the weights are of {trained}; leave algorithm= off")
         shapes = observation_shape(experiment.observation), build_action_space(experiment.action_space).n
         try:
+            import torch._meta_registrations
+
             with torch.device("meta"):  # shapes only: the weights of a model may take gigabytes
                 networks = build_networks(experiment.network, experiment.algorithm, *shapes, None)
             absent = match_service(tensors, networks, metadata.sensor, model.source)[1]
