@@ -20,7 +20,12 @@ _USED = ("checkpoint", "collectors", "data", "envs", "modules", "objectives", "w
 _COMPILER = "torch._dynamo"
 _RAY = "ray"
 _META = "torch._meta_registrations"
-_AFTER_META = ("torch._dynamo", "torch._inductor", "torch._functorch.aot_autograd", "torch.utils._content_store")
+_AFTER_META = (
+    "torch._dynamo",
+    "torch._inductor",
+    "torch._functorch.aot_autograd",
+    "torch.utils._content_store",
+)
 """Modules that are whole only if `_META` was imported before them."""
 _RARELY = 50_000
 """New objects between two collections of garbage. Imports make half a million, of which none is garbage; at Python's

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+import torch._meta_registrations  # for the device "meta", which commands import PyTorch without
 
 from deepracer_exp.agents.actor_critic import PolicyNetworks
 from deepracer_exp.agents.build import build_networks
@@ -137,8 +138,6 @@ def _fit(
             raise BadInput("algorithm", f"the weights are of {trained}; leave algorithm= off")
         shapes = observation_shape(experiment.observation), build_action_space(experiment.action_space).n
         try:
-            import torch._meta_registrations
-
             with torch.device("meta"):  # shapes only: the weights of a model may take gigabytes
                 networks = build_networks(experiment.network, experiment.algorithm, *shapes, None)
             absent = match_service(tensors, networks, metadata.sensor, model.source)[1]
