@@ -251,8 +251,8 @@ how
 exit code: 0 all trials are done; 2 bad input; 3 all trials failed, or the database did not answer; 130, 143 interrupted
 """
 _WORDS = ("report", "best")
-_WORKER, _MLFLOW = "deepracer_exp.sweeps.queue.worker", "deepracer_exp.tracking.mlflow_run"
-"""What a fork server imports once for all workers: MLflow alone would take each of them a second."""
+_WORKER = "deepracer_exp.sweeps.queue.worker"
+"""What a fork server imports once for all workers."""
 
 
 def _sweep(args: argparse.Namespace) -> int:
@@ -270,8 +270,7 @@ def _sweep(args: argparse.Namespace) -> int:
         print(request.composition.yaml(), end="")
         return 0
     print_start()
-    records = "tracking=off" not in request.base
-    start_workers_early(request.entry.sweep.executor.kind == "local", _WORKER, *[_MLFLOW] * records)
+    start_workers_early(request.entry.sweep.executor.kind == "local", _WORKER)
 
     from rich.console import Console
 

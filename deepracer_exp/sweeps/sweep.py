@@ -28,6 +28,7 @@ from deepracer_exp.env.setup import build_setup
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, TrialGroup
 from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.rewards.reward import RewardFunction
+from deepracer_exp.tracking.mlflow_process import RemoteRun
 from deepracer_exp.tracking.store import Store, resolve_store
 from deepracer_exp.tracking.study_run import Progress, StudyRun
 from deepracer_exp.tracking.tracking_file import Status
@@ -147,7 +148,7 @@ def begin_study_run(
     # MLflow cannot create a run only if there is none: one driver at a time looks and creates it.
     with resolve_database(request.entry.sweep.storage, runs_dir).creation_lock(storage.engine):
         objectives = request.entry.sweep.objectives
-        run = StudyRun(store, request.study, objectives, space.as_text(), request.base)
+        run = StudyRun(store, request.study, objectives, space.as_text(), request.base, RemoteRun)
         return run, run.wait_for_id()
 
 

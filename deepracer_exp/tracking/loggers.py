@@ -26,6 +26,7 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.files import TENSORBOARD, WANDB
 
 from .metrics import recordable_values
+from .mlflow_process import RemoteRun
 from .mlflow_tracker import MLflowTracker
 from .store import resolve_store
 from .tracker import FINISH_S, Tracker
@@ -162,7 +163,7 @@ def open_tracker(config: TrackingConfig, runs_dir: Path) -> Tracker:
     if isinstance(config, TrackingOff):
         return Tracker()
     if isinstance(config, MLflowTracking):
-        return MLflowTracker(resolve_store(config.uri, runs_dir))
+        return MLflowTracker(resolve_store(config.uri, runs_dir), RemoteRun)
     if importlib.util.find_spec(config.kind) is None:
         raise BadInput(
             f"tracking={config.kind}: needs the package {config.kind}; install the project with its extra: "

@@ -11,6 +11,7 @@ from deepracer_exp.runs.files import TRACKING
 
 from .metadata import END_TAG
 from .metrics import now_ms, points_of
+from .mlflow_process import Connect, connect_here
 from .projection import MLflowProjection
 from .store import Store
 from .store_thread import StoreThread
@@ -26,8 +27,9 @@ class MLflowTracker(Tracker):
     So `safe_until` and `log_artifact` have nothing to do, and `log` only lets the thread begin.
     """
 
-    def __init__(self, store: Store) -> None:
-        self._store = store
+    def __init__(self, store: Store, connect: Connect = connect_here) -> None:
+        """Record in a store; `connect` says which process makes the calls."""
+        self._store, self._connect = store, connect
         self._file: TrackingFile
         self._projection: MLflowProjection
         self._thread: StoreThread
@@ -49,7 +51,7 @@ class MLflowTracker(Tracker):
         again = replace(run, status=None, end_ms=None, complete=False, tags=tags)
         is_new = not (folder / TRACKING).exists()
         self._file = TrackingFile(folder, again, self._store.shown)
-        self._projection = MLflowProjection(self._store, self._file, is_new=is_new)
+        self._projection = MLflowProjection(self._store, self._file, is_new=is_new, connect=self._connect)
         self._thread = StoreThread(self._projection.update, self._store.shown, "the training continues")
 
     @override
@@ -68,6 +70,7 @@ class MLflowTracker(Tracker):
     def finish(self, status: Status, deadline_s: float = FINISH_S) -> None:
         self._file.change(status=status, end_ms=now_ms())
         complete = self._thread.finish(deadline_s) and self._thread.refusal is None
+        self._projection.close(is_done=self._thread.has_ended)
         self._file.change(complete=complete)
         if not complete:
             reason = self._thread.refusal or self._thread.outage or f"no answer within {deadline_s:g} s"

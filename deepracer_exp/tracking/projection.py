@@ -29,6 +29,7 @@ from deepracer_exp.runs.labels import read_labels
 from .calls import StoreRefusedError
 from .metadata import END_TAG, label_tags
 from .metrics import Point, now_ms, points_of, without_evaluation
+from .mlflow_process import Connect, RemoteRun, connect_here, released
 from .store import Store
 from .store_thread import refused_of
 from .tracking_file import TrackingFile
@@ -59,12 +60,15 @@ class MLflowProjection:
         written: number of points of metrics.jsonl that were written.
     """
 
-    def __init__(self, store: Store, file: TrackingFile, *, is_new: bool = False) -> None:
+    def __init__(
+        self, store: Store, file: TrackingFile, *, is_new: bool = False, connect: Connect = connect_here
+    ) -> None:
         """Project the folder of a tracking.json to a store; `is_new`: there was no attempt to create the run there."""
         self.beside: list[Point] = []
         self.written = 0
         self._store, self._file, self._folder = store, file, file.folder
-        self._run: MLflowRun | None = None
+        self._connect = connect
+        self._run: MLflowRun | RemoteRun | None = None
         self._is_new = is_new
         self._rows = 0
         """Number of rows of metrics.jsonl that MLflow has."""
@@ -95,7 +99,7 @@ class MLflowProjection:
         writes["the end"] = partial(run.end, tracked.status, tracked.end_ms or now_ms())
         return {**refused, **refused_of(writes)}
 
-    def _write_values(self, run: "MLflowRun") -> Mapping[str, str]:
+    def _write_values(self, run: "MLflowRun | RemoteRun") -> Mapping[str, str]:
         """Write parameters, metrics and tags in one request; one after the other where the store refuses that."""
         params = self._file.run.params
         try:
@@ -110,11 +114,13 @@ class MLflowProjection:
                 }
             )
 
-    def _opened(self) -> "MLflowRun":
-        from .mlflow_run import MLflowRun
+    def close(self, *, is_done: bool) -> None:
+        """Let go of the run; `is_done`: no update can still be under way."""
+        released(self._run, is_done=is_done)
 
+    def _opened(self) -> "MLflowRun | RemoteRun":
         if self._run is None:
-            run = MLflowRun(self._store)
+            run = self._connect(self._store)
             is_first, self._is_new = self._is_new, False
             run.open(self._file.run, is_first=is_first)
             self._file.change(run_id=run.run_id)
@@ -122,7 +128,10 @@ class MLflowProjection:
         return self._run
 
     def _write_metrics(
-        self, run: "MLflowRun", params: Mapping[str, str] | None = None, tags: Mapping[str, str] | None = None
+        self,
+        run: "MLflowRun | RemoteRun",
+        params: Mapping[str, str] | None = None,
+        tags: Mapping[str, str] | None = None,
     ) -> None:
         """Write the rows that a checkpoint covers, with parameters and tags."""
         covered, beside = self._covered(), list(self.beside)
@@ -174,11 +183,11 @@ class MLflowProjection:
                 tags[END_TAG] = f"{summary['status']}: {summary['reason']}"
         return tags
 
-    def _write_file(self, run: "MLflowRun", path: Path, folder: str | None) -> None:
+    def _write_file(self, run: "MLflowRun | RemoteRun", path: Path, folder: str | None) -> None:
         if (path, folder) not in self._files:
             run.log_artifact(path, folder)
             self._files.add((path, folder))
 
-    def _conclude(self, run: "MLflowRun", files: Collection[str]) -> None:
+    def _conclude(self, run: "MLflowRun | RemoteRun", files: Collection[str]) -> None:
         if summary := read_object(self._folder / SUMMARY):
             run.conclude(self._file.run, summary, files)

@@ -53,7 +53,7 @@ class StoreThread:
         self._thread.start()
 
     def begin(self) -> None:
-        """Let the first update begin: it imports MLflow, for a second of a core that a start needs itself."""
+        """Let the first update begin: it imports MLflow, for two seconds of a core that a start needs itself."""
         self._may_begin.set()
 
     def finish(self, deadline_s: float) -> bool:
@@ -63,6 +63,11 @@ class StoreThread:
         self._may_begin.set()
         self._thread.join(deadline_s)
         return self._is_complete
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether no update is under way, and none will be."""
+        return not self._thread.is_alive()
 
     def _work(self) -> None:
         # Jitter, so that processes that began to wait together do not return together.

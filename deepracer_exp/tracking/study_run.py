@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from .calls import StoreRefusedError, StoreUnavailableError, ended_within
 from .metadata import END_TAG, NOTE, PARENT, STUDY, param_text, study_view, user_tags
 from .metrics import Point, now_ms, points_at, trial_metrics
+from .mlflow_process import Connect, RemoteRun, connect_here, released
 from .store import Store
 from .store_thread import StoreThread, refused_of
 from .tracking_file import Status, TrackedRun
@@ -78,16 +79,20 @@ class StudyRun:
         objectives: Sequence[str],
         space: Mapping[str, str],
         base: Sequence[str],
+        connect: Connect = connect_here,
     ) -> None:
-        """Start creating or finding the run of a search: expressions by key, and overrides of all trials."""
+        """Start creating or finding the run of a search: expressions by key, and overrides of all trials.
+
+        `connect` says which process makes the calls.
+        """
         params = _params(space, base)
         search = hashlib.sha256(json.dumps([dict(space), list(base)], sort_keys=True).encode())
         tags = {STUDY: study, SEARCH: search.hexdigest()[:12], KIND: "study", **_SOURCE, **user_tags()}
-        self._store = store
+        self._store, self._connect = store, connect
         self._tracked = TrackedRun(f"sweep {study}", study, now_ms(), params, tags)
         self._searched = [_param_name(key) for key in space]
         self._objectives = objectives
-        self._run: MLflowRun | None = None
+        self._run: MLflowRun | RemoteRun | None = None
         self._progress: Progress | None = None
         self._written: Progress | None = None
         """Progress that MLflow has."""
@@ -120,6 +125,7 @@ class StudyRun:
         """Write what is left for at most `deadline_s`, end the run and return whether it was ended."""
         self._status = status
         self._thread.finish(deadline_s)
+        released(self._run, is_done=self._thread.has_ended)
         if not self._is_ended:
             _log.warning("MLflow (%s): the study's run could not be marked %s", self._store.shown, status)
         return self._is_ended
@@ -143,18 +149,16 @@ class StudyRun:
             writes["the end"] = lambda: self._end(run, status)
         return refused_of(writes)
 
-    def _opened(self) -> "MLflowRun":
-        from .mlflow_run import MLflowRun
-
+    def _opened(self) -> "MLflowRun | RemoteRun":
         if self._run is None:
-            run = MLflowRun(self._store)
+            run = self._connect(self._store)
             run.open_only(self._tracked, (STUDY, SEARCH, KIND))
             run.log(params=self._tracked.params)
             self._run = run
             self._settled.set()
         return self._run
 
-    def _show_trials(self, run: "MLflowRun") -> None:
+    def _show_trials(self, run: "MLflowRun | RemoteRun") -> None:
         if self._is_shown:
             return
         self._adopt(run)
@@ -162,10 +166,10 @@ class StudyRun:
         run.set_experiment_tags({STUDY: study, **study_view(self._objectives, self._searched)})
         self._is_shown = True
 
-    def _adopt(self, run: "MLflowRun") -> None:
+    def _adopt(self, run: "MLflowRun | RemoteRun") -> None:
         run.adopt({STUDY: self._tracked.tags[STUDY]}, but=KIND)
 
-    def _write_progress(self, run: "MLflowRun") -> None:
+    def _write_progress(self, run: "MLflowRun | RemoteRun") -> None:
         progress = self._progress
         if progress is None or progress is self._written:
             return
@@ -184,7 +188,7 @@ class StudyRun:
             run.describe_study(f"trial {progress.best_trial}, {progress.best_shown}")
         self._written = progress
 
-    def _end(self, run: "MLflowRun", status: Status) -> None:
+    def _end(self, run: "MLflowRun | RemoteRun", status: Status) -> None:
         run.log(tags={END_TAG: _ENDS[status]})
         run.end(status, now_ms())
         self._is_ended = True
@@ -209,7 +213,13 @@ class StudyRun:
 
 
 def open_trial_run(
-    store: Store, study: str, trial: int, parent_run_id: str, base: Sequence[str], deadline_s: float = 30.0
+    store: Store,
+    study: str,
+    trial: int,
+    parent_run_id: str,
+    base: Sequence[str],
+    deadline_s: float = 30.0,
+    connect: Connect = connect_here,
 ) -> str | None:
     """Return the id in MLflow of the run that groups the seeds of a trial, created on the first call.
 
@@ -218,43 +228,55 @@ def open_trial_run(
     tags = {STUDY: study, KIND: "trial", TRIAL: str(trial), PARENT: parent_run_id, **_SOURCE, **user_tags()}
     tracked = TrackedRun(f"trial {trial}", study, now_ms(), _params({}, base), tags)
 
-    def open_run(run: "MLflowRun") -> None:
+    def open_run(run: "MLflowRun | RemoteRun") -> None:
         run.open_only(tracked, (STUDY, KIND, TRIAL, PARENT))
         run.log(params=tracked.params)
 
-    return _within(deadline_s, store, f"trial {trial} has no run there", open_run)
+    return _within(deadline_s, store, f"trial {trial} has no run there", open_run, connect)
 
 
 def end_trial_run(
-    store: Store, run_id: str, status: Status, reason: str, values: Mapping[str, float | None]
+    store: Store,
+    run_id: str,
+    status: Status,
+    reason: str,
+    values: Mapping[str, float | None],
+    connect: Connect = connect_here,
 ) -> None:
     """End the run of a trial, or change how it has ended, with its values by metric; errors are logged."""
 
-    def end_run(run: "MLflowRun") -> None:
+    def end_run(run: "MLflowRun | RemoteRun") -> None:
         run.read(run_id)
         points = points_at(values, 0, now_ms())
         run.log(points if _is_news(run, points) else (), tags={END_TAG: reason})
         run.end(status, now_ms())
 
-    _within(30.0, store, f"run {run_id} was not ended there", end_run)
+    _within(30.0, store, f"run {run_id} was not ended there", end_run, connect)
 
 
-def _is_news(run: "MLflowRun", points: Sequence[Point]) -> bool:
+def _is_news(run: "MLflowRun | RemoteRun", points: Sequence[Point]) -> bool:
     """Return whether one of the points has a value that is not the newest of its metric."""
     return any(run.metrics.get(key) != value for key, value, *_ in points)
 
 
-def _within(deadline_s: float, store: Store, failure: str, call: "Callable[[MLflowRun], None]") -> str | None:
+def _within(
+    deadline_s: float,
+    store: Store,
+    failure: str,
+    call: "Callable[[MLflowRun | RemoteRun], None]",
+    connect: Connect,
+) -> str | None:
     """Return the id of the run after `call`; None, with a warning, if it failed or did not finish in time.
 
     MLflow itself retries for more than a minute to open a database.
     """
 
     def work() -> str | None:
-        from .mlflow_run import MLflowRun
-
-        run = MLflowRun(store)
-        call(run)
+        run = connect(store)
+        try:
+            call(run)
+        finally:
+            released(run)
         return run.run_id
 
     try:

@@ -34,6 +34,7 @@ from deepracer_exp.sweeps.search.pruners import FirstOf, PruneDecision, is_worse
 from deepracer_exp.sweeps.trial import Interrupted, SeedRun, Trial, runs_as_json
 from deepracer_exp.tracking.metadata import PARENT, STUDY
 from deepracer_exp.tracking.metrics import trial_metrics
+from deepracer_exp.tracking.mlflow_process import RemoteRun
 from deepracer_exp.tracking.study_run import TRIAL, end_trial_run, open_trial_run
 from deepracer_exp.tracking.tracking_file import Status
 from deepracer_exp.training.budget import RunEnded
@@ -312,7 +313,9 @@ class TrialRun(Callback):
         store, study_run_id = self._config.store, self._config.study_run_id
         if store is None or study_run_id is None or self._config.config.seeds == 1:
             return study_run_id
-        trial_run_id = open_trial_run(store, self._config.study, self._number, study_run_id, overrides)
+        trial_run_id = open_trial_run(
+            store, self._config.study, self._number, study_run_id, overrides, connect=RemoteRun
+        )
         return trial_run_id or study_run_id
 
     def _track(self, ended: Trial) -> None:
@@ -329,7 +332,7 @@ class TrialRun(Callback):
         }
         status: Status = "FAILED" if ended.state == "FAIL" else "FINISHED"
         end = f"{ended.state.lower()}: {ended.reason}"
-        end_trial_run(self._config.store, run_id, status, end, trial_metrics(values))
+        end_trial_run(self._config.store, run_id, status, end, trial_metrics(values), RemoteRun)
 
     def _patiently(self, call: Callable[[], Value]) -> Value:
         return patiently(call, self._config.config.patience_s)
