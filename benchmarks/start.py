@@ -12,6 +12,9 @@ and a sweep of one trial:
 
 - `first_trial_s`: until the folder of the first trial's run is there, and the trial has begun.
 
+Bytecode is there, as on a racer's machine: it is written, whatever the environment says, by a first run that is not
+counted.
+
 With `--before`, another checkout with its own .venv does the same in turns, and ratios come with their 95 per cent
 bootstrap interval.
 
@@ -19,6 +22,7 @@ The imports are those of the training in one process (`python -X importtime`), b
 when the first of them was imported. "later" are those that begin after the first iteration.
 """
 
+import os
 import re
 import resource
 import subprocess
@@ -45,6 +49,7 @@ _SWEEP = (
     *("sweep", "experiment=tiny", "algorithm.lr=tag(log,interval(1e-4,1e-3))"),
     *("sweep.trials=1", "sweep.seeds=1", "sweep.workers=1", "sweep.rerank=0", "sweep.pruners=[]"),
 )
+ENVIRONMENT = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
 _LOOK_EVERY_S = 0.005
 _RESAMPLES = 2000
 _LINE = re.compile(r"import time:\s+(\d+) \|\s+\d+ \|\s+(\S+)")
@@ -94,7 +99,12 @@ def run(
     began, first_s = time.monotonic(), None
     with (folder / "output.txt").open("w") as output:
         process = subprocess.Popen(
-            line, cwd=folder, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT
+            line,
+            cwd=folder,
+            env=ENVIRONMENT,
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
         )
         while process.poll() is None:
             if first_s is None and has_begun(folder):
@@ -135,6 +145,7 @@ def packages(python: Path, overrides: Sequence[str], folder: Path) -> list[Packa
     """Train in one process and return what it imported, the package with the most seconds first."""
     line = [str(python), "-X", "importtime", str(python.with_name("deepracer-exp")), *_TRAINING]
     pipes: dict[str, Any] = {
+        "env": ENVIRONMENT,
         "stdin": subprocess.DEVNULL,
         "stdout": subprocess.DEVNULL,
         "stderr": subprocess.PIPE,
@@ -187,11 +198,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         pythons["before"] = options.before.absolute() / ".venv" / "bin" / "python"
     figures: dict[str, list[dict[str, float]]] = {name: [] for name in pythons}
     with tempfile.TemporaryDirectory() as place:
-        for turn in range(options.turns):
+        for turn in range(options.turns + 1):
             for name, python in pythons.items():
                 folder = Path(place, f"{name}{turn}")
                 folder.mkdir()
-                figures[name].append(measure(python, options.overrides, folder))
+                measured = measure(python, options.overrides, folder)
+                if turn:  # the first one writes the bytecode
+                    figures[name].append(measured)
         largest = packages(pythons["now"], options.overrides, Path(place))
     data: dict[str, Any] = {"turns": figures, "wanted": WANTED_S, "imports": [vars(each) for each in largest]}
     rows = []

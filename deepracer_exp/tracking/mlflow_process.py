@@ -7,6 +7,7 @@ ends with it.
 
 import atexit
 import contextlib
+import gc
 import os
 import subprocess
 import sys
@@ -215,6 +216,8 @@ def _answer(questions: Connection, answers: Connection) -> None:
                 take_over(*arguments)
             elif method == "connect":
                 run = connect_here(*arguments)
+                gc.freeze()
+                gc.enable()
             else:
                 value = getattr(run, method)(*arguments, **options)
             about = (None, {}) if run is None else (run.run_id, run.metrics)
@@ -225,6 +228,7 @@ def _answer(questions: Connection, answers: Connection) -> None:
 
 
 def _main() -> None:
+    gc.disable()  # while MLflow is imported, of which nothing is garbage
     questions, answers = Connection(os.dup(0), writable=False), Connection(os.dup(1), readable=False)
     # What MLflow prints is for nobody.
     with open(os.devnull, "r+b") as nothing:

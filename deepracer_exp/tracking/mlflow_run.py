@@ -1,18 +1,22 @@
 """One run in an MLflow store, by MlflowClient alone: no global tracking uri, no active run.
 
-Importing this module imports MLflow (1.2 s alone, 2 to 3 s beside a starting training), so a training
-does it in the thread that records. Every call may be repeated: MLflow keys a metric point by run, key, step,
+Importing this module imports MLflow (two seconds with its database), so a training leaves it to another process
+(`mlflow_process`). Every call may be repeated: MLflow keys a metric point by run, key, step,
 timestamp and value, and parameters, tags, files and the end status are the same when written twice. So a
 request of a killed process that a slow server handles late does no harm either.
 """
 
+import contextlib
+import os
+import shutil
+import sqlite3
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from mlflow import MlflowClient
+from mlflow import MlflowClient, __version__
 from mlflow.entities import Metric, Param, RunTag, ViewType
 from mlflow.exceptions import MlflowException
 from mlflow.utils.validation import MAX_METRICS_PER_BATCH, MAX_PARAMS_TAGS_PER_BATCH, MAX_TAG_VAL_LENGTH
@@ -274,10 +278,30 @@ def _with(tags: Mapping[str, str]) -> str:
 def _create_whole(file: Path) -> None:
     """Create an SQLite store under another name and move it into place, so that a killed process leaves none.
 
-    MLflow creates its tables in dozens of steps and cannot open an incomplete store.
+    MLflow creates its tables in dozens of steps, which take seconds, and cannot open an incomplete store. Beside the
+    compiled modules of this package there is a store without experiments from then on, of which the next is a copy.
     """
     aside = file.with_name(f".{file.name}.new")
     for left in file.parent.glob(f"{aside.name}*"):
         left.unlink()
-    MlflowClient(tracking_uri=f"sqlite:///{aside}").search_experiments(max_results=1)
+    empty = Path(__file__).with_name("__pycache__") / f"mlflow-{__version__}.db"
+    if empty.is_file():
+        shutil.copyfile(empty, aside)
+    else:
+        MlflowClient(tracking_uri=f"sqlite:///{aside}").search_experiments(max_results=1)
+        with contextlib.suppress(OSError):  # of an installation that cannot be written
+            _keep_empty(aside, empty)
     aside.replace(file)
+
+
+def _keep_empty(created: Path, empty: Path) -> None:
+    """Keep a copy of a new store without its experiment, which names the working folder."""
+    unfinished = empty.with_name(f".{empty.name}.{os.getpid()}")
+    empty.parent.mkdir(exist_ok=True)
+    shutil.copyfile(created, unfinished)
+    try:
+        with contextlib.closing(sqlite3.connect(unfinished)) as database, database:
+            database.execute("DELETE FROM experiments")
+        unfinished.replace(empty)
+    finally:
+        unfinished.unlink(missing_ok=True)
