@@ -54,6 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         args = parse(words)
     except BadInput as error:
         sys.exit(_fail(error, BadInput.exit_code, args))
+    args.has_own_process = arguments is None
     if arguments is None:
         own_scratch()
     if arguments is not None:

@@ -4,21 +4,31 @@ import os
 import signal
 import sys
 
+_PROGRAM = "deepracer_exp.cli"
+"""What every worker imports first: the program of the process that started it."""
+
 
 def start_workers_early(wanted: bool, *modules: str) -> None:
     """Start the server that workers are forked from, which imports what they need while this process does its part.
 
-    `modules` are imported for workers of a sweep; without them, what workers of a collector need.
+    One that runs already stays, or is ended if no workers are wanted. `modules` are imported for workers of a sweep;
+    without them, what workers of a collector need.
     """
-    if not wanted or not sys.platform.startswith("linux"):
+    if not sys.platform.startswith("linux"):
         return
     import multiprocessing
     from multiprocessing import forkserver
 
+    if not wanted:
+        forkserver._forkserver._stop()  # type: ignore[attr-defined]
+        return
+
     multiprocessing.set_start_method("forkserver", force=True)
     package = "deepracer_exp.collectors"
     needed = modules or (f"{package}.worker",)
-    multiprocessing.set_forkserver_preload([f"{package}.fork_server", *needed, f"{package}.fork_ready"])
+    multiprocessing.set_forkserver_preload(
+        [f"{package}.fork_server", *needed, _PROGRAM, f"{package}.fork_ready"]
+    )
     # Workers share the cores among themselves already; a linear-algebra thread pool in each would only compete.
     before = os.environ.get("OMP_NUM_THREADS")
     os.environ["OMP_NUM_THREADS"] = "1"

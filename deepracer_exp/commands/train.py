@@ -113,6 +113,10 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def _train(args: argparse.Namespace) -> int:
+    # Most trainings want workers, which begin to import before it is known; `main` called by a program waits for it.
+    if args.has_own_process and args.options is None and not args.cfg:
+        start_workers_early("collector=in_process" not in args.overrides)
+
     from deepracer_exp.config.compose import compose_experiment, expand_grid
     from deepracer_exp.config.options import options_of
 
@@ -258,6 +262,9 @@ _WORKER = "deepracer_exp.sweeps.queue.worker"
 def _sweep(args: argparse.Namespace) -> int:
     if args.overrides and args.overrides[0] in _WORDS:
         return _show_study(*args.overrides)
+    if args.has_own_process and not args.cfg:
+        start_workers_early("sweep/executor=ray" not in args.overrides, _WORKER)
+
     from deepracer_exp.sweeps.plan import plan_sweep
 
     plan = plan_sweep(args.overrides, is_only_shown=args.cfg)
