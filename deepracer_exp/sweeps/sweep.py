@@ -42,7 +42,7 @@ from .queue.launcher import LocalLauncher
 from .queue.ray_launcher import RayLauncher
 from .queue.storage import open_storage, patiently, resolve_database
 from .queue.study import open_study
-from .queue.worker_config import Parent, WorkerConfig, plan_trial
+from .queue.worker_config import RUN_ID, Parent, WorkerConfig, plan_trial
 from .report.best import (
     FreshLaps,
     best_line,
@@ -111,7 +111,9 @@ def sweep(plan: SweepPlan, console: Console) -> tuple[Study, Path, int]:
         storage = open_storage(config.storage, runs_dir)
         study = open_study(request, overrides, space, parent, storage, runs_dir)
         acting.remember()
-        study_run, study_run_id = begin_study_run(request, space, store, storage, runs_dir)
+        # Only runs above the seeds of a trial cannot do without it; the id of an earlier start may be of another store.
+        waits = config.seeds > 1 or RUN_ID in study.user_attrs
+        study_run, study_run_id = begin_study_run(request, space, store, storage, runs_dir, waits=waits)
         worker_config = WorkerConfig(
             study=request.study,
             runs_dir=launcher.folder(runs_dir),
@@ -124,8 +126,6 @@ def sweep(plan: SweepPlan, console: Console) -> tuple[Study, Path, int]:
             evaluations=_evaluations(experiment, request),
             cores=launcher.cores,
         )
-        if study_run_id is not None:
-            study.set_user_attr("mlflow_run_id", study_run_id)
         status: Status = "FAILED"
         code = 0
         try:
@@ -140,16 +140,25 @@ def sweep(plan: SweepPlan, console: Console) -> tuple[Study, Path, int]:
 
 
 def begin_study_run(
-    request: SweepRequest, space: SearchSpace, store: Store | None, storage: RDBStorage, runs_dir: Path
+    request: SweepRequest,
+    space: SearchSpace,
+    store: Store | None,
+    storage: RDBStorage,
+    runs_dir: Path,
+    *,
+    waits: bool = True,
 ) -> tuple[StudyRun | None, str | None]:
-    """Begin or continue the run of a study in MLflow; return it with its id, None if the store does not answer."""
+    """Begin or continue the run of a study in MLflow; return it with its id.
+
+    The id is None if the store does not answer, or if nobody `waits` for it: the first trials' runs are then put under
+    the study's at the end.
+    """
     if store is None:
         return None, None
-    # MLflow cannot create a run only if there is none: one driver at a time looks and creates it.
-    with resolve_database(request.entry.sweep.storage, runs_dir).creation_lock(storage.engine):
-        objectives = request.entry.sweep.objectives
-        run = StudyRun(store, request.study, objectives, space.as_text(), request.base, RemoteRun)
-        return run, run.wait_for_id()
+    config, database = request.entry.sweep, resolve_database(request.entry.sweep.storage, runs_dir)
+    lock = partial(database.creation_lock, storage.engine)
+    run = StudyRun(store, request.study, config.objectives, space.as_text(), request.base, RemoteRun, lock)
+    return run, run.wait_for_id() if waits else None
 
 
 def _run(
@@ -168,9 +177,15 @@ def _run(
             study_run.update(progress_of(now, worker_config.config, study))
 
     with Interruption() as interruption, SweepView(worker_config, launcher.workers, console) as view:
-        view.show(patiently(claims.all, patience_s))
+
+        def show(now: Sequence[Claim], stage: str = "") -> None:
+            if study_run is not None and study_run.has_new_id():
+                study.set_user_attr(RUN_ID, study_run.run_id)
+            view.show(now, stage)
+
+        show(patiently(claims.all, patience_s))
         if not claims.is_done(worker_config.config.trials):
-            code = Driver(worker_config, storage, launcher, view.show, track).run(interruption)
+            code = Driver(worker_config, storage, launcher, show, track).run(interruption)
             if code is not None:
                 return code
         patiently(partial(report_results, claims, storage), patience_s)

@@ -7,6 +7,7 @@ import re
 import shlex
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -80,15 +81,17 @@ class StudyRun:
         space: Mapping[str, str],
         base: Sequence[str],
         connect: Connect = connect_here,
+        creation_lock: Callable[[], AbstractContextManager[object]] = nullcontext,
     ) -> None:
         """Start creating or finding the run of a search: expressions by key, and overrides of all trials.
 
-        `connect` says which process makes the calls.
+        `connect` says which process makes the calls. MLflow cannot create a run only if there is none: `creation_lock`
+        lets one process at a time look and create it.
         """
         params = _params(space, base)
         search = hashlib.sha256(json.dumps([dict(space), list(base)], sort_keys=True).encode())
         tags = {STUDY: study, SEARCH: search.hexdigest()[:12], KIND: "study", **_SOURCE, **user_tags()}
-        self._store, self._connect = store, connect
+        self._store, self._connect, self._creation_lock = store, connect, creation_lock
         self._tracked = TrackedRun(f"sweep {study}", study, now_ms(), params, tags)
         self._searched = [_param_name(key) for key in space]
         self._objectives = objectives
@@ -99,6 +102,7 @@ class StudyRun:
         self._report: Path | None = None
         self._status: Status | None = None
         self._is_shown, self._is_ended = False, False
+        self._is_id_known = False
         self._settled = threading.Event()
         self._thread = StoreThread(self._update, store.shown, "the sweep continues")
         self._thread.begin()
@@ -112,6 +116,11 @@ class StudyRun:
     def run_id(self) -> str | None:
         """MLflow's id of the run, once it exists."""
         return None if self._run is None else self._run.run_id
+
+    def has_new_id(self) -> bool:
+        """Return whether the run's id has become known since the last call."""
+        known, self._is_id_known = self._is_id_known, self.run_id is not None
+        return self._is_id_known and not known
 
     def update(self, progress: Progress) -> None:
         """Record the progress of the study; returns at once."""
@@ -152,7 +161,8 @@ class StudyRun:
     def _opened(self) -> "MLflowRun | RemoteRun":
         if self._run is None:
             run = self._connect(self._store)
-            run.open_only(self._tracked, (STUDY, SEARCH, KIND))
+            with self._creation_lock():
+                run.open_only(self._tracked, (STUDY, SEARCH, KIND))
             run.log(params=self._tracked.params)
             self._run = run
             self._settled.set()

@@ -1,5 +1,6 @@
 """The database of studies: its address checked, opened safely by many processes at once, and waited for."""
 
+import atexit
 import logging
 import sqlite3
 from collections.abc import Callable, Iterator
@@ -158,9 +159,12 @@ def open_storage(url: str | None, runs_dir: Path, patience_s: float = 0.0) -> RD
     database = resolve_database(url, runs_dir)
     with reading(database.shown, "a place where files can be written, or a server"):
         try:
-            return _waiting(lambda: _open(database), patience_s)
+            storage = _waiting(lambda: _open(database), patience_s)
         except (DBAPIError, StorageInternalError) as error:
             raise BadInput(database.shown, _reason(error)) from None
+    # SQLite then moves what it has written last into the file itself, which may be copied alone.
+    atexit.register(storage.engine.dispose)
+    return storage
 
 
 def patiently(call: Callable[[], Result], patience_s: float) -> Result:

@@ -46,7 +46,7 @@ from deepracer_exp.training.trainer import Trainer
 from .claims import TrialClaims
 from .lease import Lease
 from .storage import patiently
-from .worker_config import WorkerConfig, plan_trial
+from .worker_config import RUN_ID, WorkerConfig, plan_trial
 
 Value = TypeVar("Value")
 
@@ -311,7 +311,10 @@ class TrialRun(Callback):
     def _mlflow_parent(self, overrides: Sequence[str]) -> str | None:
         """Return MLflow's id of the run above those of the trial: the study's, with several seeds one of the trial."""
         store, study_run_id = self._config.store, self._config.study_run_id
-        if store is None or study_run_id is None or self._config.config.seeds == 1:
+        if store is not None and self._config.config.seeds == 1:
+            # The driver has started the workers before MLflow answered.
+            return study_run_id or self._patiently(lambda: self._study.user_attrs.get(RUN_ID))
+        if store is None or study_run_id is None:
             return study_run_id
         trial_run_id = open_trial_run(
             store, self._config.study, self._number, study_run_id, overrides, connect=RemoteRun

@@ -20,6 +20,9 @@ from deepracer_exp.tracking.store import Store
 from deepracer_exp.training.clone import plan_clone, read_parent
 from deepracer_exp.training.plan import TrainPlan, plan_training
 
+RUN_ID = "mlflow_run_id"
+"""Attribute of a study in Optuna: MLflow's id of its run, once it is known."""
+
 
 @dataclass(frozen=True)
 class Parent:
@@ -57,7 +60,7 @@ class WorkerConfig:
     store: Store | None
     """The MLflow that records the runs; None with `tracking=off`."""
     study_run_id: str | None
-    """MLflow's id of the study's run, None if it has none."""
+    """MLflow's id of the study's run, None if it has none, or none yet."""
     evaluations: int | None
     """Evaluations of a trial before its end, None where that depends on the trial."""
     cores: int
