@@ -27,6 +27,9 @@ again = gc.get_threshold()
 
 import ray, torch
 
+with torch._subclasses.fake_tensor.FakeTensorMode():
+    shape = torch.nn.Conv2d(3, 8, 3)(torch.zeros(1, 3, 9, 9)).shape
+assert shape == (1, 8, 7, 7)
 assert torch.compile(lambda x: 2 * x + 1, backend="eager")(torch.ones(1)) == 3.0
 assert torch.compiler.disable(lambda x: x)(5) == 5
 weight = torch.ones(1, requires_grad=True)

@@ -36,6 +36,24 @@ def command(body: str, **options: object) -> subprocess.Popen[str]:
     )
 
 
+def test_a_command_ends_at_once_but_with_all_that_must_be_done_first() -> None:
+    code = """
+import atexit, sys, threading, time
+from deepracer_exp.cli import end_process
+class Never:
+    def __del__(self):
+        print("taken apart", flush=True)
+never = Never()
+atexit.register(print, "exit function")
+threading.Thread(target=lambda: (time.sleep(0.2), print("thread"))).start()
+sys.stdout.write("unflushed ")
+end_process(3)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (3, "")
+    assert done.stdout == "unflushed thread\nexit function\n"
+
+
 @pytest.mark.parametrize("code", [0, 2, 143])
 def test_the_exit_code_is_the_calls_own(code: int) -> None:
     process = command(f"print('done'); return {code}")
