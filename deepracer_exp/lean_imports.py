@@ -93,6 +93,7 @@ class _LeanTorchRL(MetaPathFinder):
         if fullname == "torch":
             spec.loader.exec_module = execute_without_meta  # type: ignore[method-assign]
             return spec
+        importlib.import_module("torch")  # while this finder is there
         sys.meta_path.remove(self)
 
         def execute_all(module: ModuleType) -> None:

@@ -119,8 +119,9 @@ class StudyRun:
 
     def has_new_id(self) -> bool:
         """Return whether the run's id has become known since the last call."""
-        known, self._is_id_known = self._is_id_known, self.run_id is not None
-        return self._is_id_known and not known
+        is_new = self.run_id is not None and not self._is_id_known
+        self._is_id_known |= is_new
+        return is_new
 
     def update(self, progress: Progress) -> None:
         """Record the progress of the study; returns at once."""
