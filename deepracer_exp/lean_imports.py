@@ -27,7 +27,7 @@ _AFTER_META = (
     "torch.utils._content_store",
 )
 """Modules that are whole only if `_META` was imported before them."""
-_RARELY = 50_000
+_RARELY = 400_000
 """New objects between two collections of garbage. Imports make half a million, of which none is garbage; at Python's
 usual 700, looking at them again and again takes a fifth of the imports' time."""
 _OPTIMIZER_METHODS = ("add_param_group", "load_state_dict", "state_dict", "zero_grad")
