@@ -22,6 +22,7 @@ from .reward_replay import TIME_LIMIT_S
 
 MOST_STEPS = 20_000
 """Number of steps above which only some episodes, evenly spaced over the training, are evaluated."""
+_NUMBERS = int, float, np.number
 Terms = Callable[[dict[str, Any]], object]
 
 
@@ -95,7 +96,9 @@ def contributed_terms(
         step = steps.iloc[evaluated[min(len(by_step), len(evaluated) - 1)]]
         place = f"episode {step['episode']}, step {step['steps']}"
         raise BadInput(source.path, f"terms {what} ({place})") from cause
-    return pd.DataFrame(by_step, index=steps.index[evaluated]).fillna(0.0)
+    names = dict.fromkeys(name for contributed in by_step for name in contributed)
+    columns = {name: np.array([contributed.get(name, 0.0) for contributed in by_step]) for name in names}
+    return pd.DataFrame(columns, index=steps.index[evaluated], copy=False)
 
 
 def _checked(terms: Terms, params: dict[str, Any]) -> dict[str, float]:
@@ -103,7 +106,9 @@ def _checked(terms: Terms, params: dict[str, Any]) -> dict[str, float]:
     if not isinstance(answer, dict) or not answer:
         raise Unusable(f"returned {str(answer)[:40]!r}, not a dict of numbers")
     for name, value in answer.items():
-        if not isinstance(value, int | float | np.number) or not math.isfinite(value):
+        # A type is compared in a tenth of the time in which it is looked up among several.
+        is_number = type(value) is float or isinstance(value, _NUMBERS)
+        if not is_number or not math.isfinite(value):
             raise Unusable(f"returned {str(value)[:40]!r} for {name!r}; accepted are finite numbers")
     return {str(name): float(value) for name, value in answer.items()}
 

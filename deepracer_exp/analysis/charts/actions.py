@@ -102,12 +102,13 @@ def _ranges(steer: Values, speed: Values) -> NDArray[np.intp]:
     low, high = np.nanmin(speed), np.nanmax(speed)
     share, pace = steer / max(np.nanmax(np.abs(steer)), 1e-9), (speed - low) / max(high - low, 1e-9)
     # Few edges are counted in less time than each value is searched among them.
-    number = np.zeros(len(steer), np.intp)
+    number = np.zeros(len(steer), np.int8)
     for edge in STEERING_EDGES:
-        number += len(SPEED_NAMES) * (share >= edge)
+        number += share >= edge
+    number *= len(SPEED_NAMES)
     for edge in SPEED_EDGES:
         number += pace >= edge
-    return number
+    return number.astype(np.intp)
 
 
 def _angle(steering_deg: float) -> str:

@@ -1,5 +1,7 @@
 """The rewards that a function returned: by place, by waypoint, by its terms, by step and by episode."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
@@ -7,6 +9,7 @@ from numpy.typing import NDArray
 from deepracer_exp.analysis.log_view import LogView, closest_waypoints, thirds
 from deepracer_exp.analysis.statistics import (
     MOST_ROWS,
+    Values,
     histogram,
     lowest_and_highest,
     means,
@@ -45,28 +48,31 @@ def reward_map(view: LogView) -> Chart | None:
     # Weighted by how often cells are driven: few steps off the road would take all colours.
     colors = color_range(of_steps)
 
-    def panel(wanted: NDArray[np.bool_], title: str, grid: Grid) -> Panel:
-        values = means(np.where(wanted, cells[grid], -1), reward, grid.count)
+    def panel(values: Values, title: str, grid: Grid) -> Panel:
         layer = grid.cells(values, "reward of a step", value_range=colors)
         return map_panel(course, [layer], title, numbers=grid is fine)
 
+    def row(kind: NDArray[np.intp], titles: Sequence[str]) -> list[Panel]:
+        """Return a panel of the rows of each kind, 0, 1, ...; -1 has none."""
+        place = kind * coarse.count + cells[coarse]
+        place[(kind < 0) | (cells[coarse] < 0)] = -1
+        values = means(place, reward, len(titles) * coarse.count).reshape(len(titles), -1)
+        return [panel(values[k], title, coarse) for k, title in enumerate(titles)]
+
     complete = view.episodes["complete"].to_numpy(bool)
-    third = thirds(rows["iteration"].to_numpy())
-    charts = [
-        [panel(np.ones(len(rows), bool), "all steps", fine)],
-        [panel(third == k, title, coarse) for k, title in enumerate(_THIRDS)],
-    ]
+    charts = [[panel(mean, "all steps", fine)], row(thirds(rows["iteration"].to_numpy()), _THIRDS)]
     if complete.any():
-        in_lap = complete[view.episode_index][view.is_driven]
-        charts[0].append(panel(in_lap, f"complete laps only ({complete.sum()})", fine))
+        in_lap = np.where(complete[view.episode_index][view.is_driven], cells[fine], -1)
+        values = means(in_lap, reward, fine.count)
+        charts[0].append(panel(values, f"complete laps only ({complete.sum()})", fine))
     actions = action_classes(view)
     if actions is not None:
         used = np.bincount(actions.number[actions.number >= 0], minlength=len(actions.names))
-        titles = {
-            int(k): f"{actions.names[k]} ({100 * used[k] / used.sum():.0f}% of steps)"
-            for k in np.argsort(-used, kind="stable")[:_ACTIONS]
-        }
-        charts.append([panel(actions.number == k, title, coarse) for k, title in titles.items()])
+        most = np.argsort(-used, kind="stable")[:_ACTIONS]
+        kind = np.full(len(used) + 1, -1, np.intp)  # the last one is of rows without an action
+        kind[most] = np.arange(len(most))
+        titles = [f"{actions.names[k]} ({100 * used[k] / used.sum():.0f}% of steps)" for k in most]
+        charts.append(row(kind[actions.number], titles))
     return Chart(
         name="reward_map",
         title="What the reward function paid, by place",
