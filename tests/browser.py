@@ -61,9 +61,17 @@ class Tab:
         self.wait_for("document.readyState === 'complete'")
 
     def draw_all(self) -> None:
-        """Unfold the page and let all figures be drawn."""
+        """Unfold the page and let all figures be drawn, those that are not yet."""
         self.evaluate("document.querySelectorAll('main details').forEach((part) => { part.open = true; })")
-        self.prepare_print()
+        # After printing, a page draws again what was drawn: here all the others, instead of all of them twice.
+        self.evaluate(
+            "(() => { const boxes = [...document.querySelectorAll('[data-plot]')];"
+            " const drawn = boxes.filter((box) => box.dataset.state);"
+            " const states = drawn.map((box) => box.dataset.state);"
+            " boxes.forEach((box) => { box.dataset.state = drawn.includes(box) ? 'kept' : 'drawn'; });"
+            " window.dispatchEvent(new Event('afterprint'));"
+            " drawn.forEach((box, at) => { box.dataset.state = states[at]; }); })()"
+        )
 
     def prepare_print(self) -> None:
         """Let the page do what it does before and after it is printed."""

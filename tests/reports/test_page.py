@@ -1,6 +1,7 @@
 """What always holds of the two pages, that of a training and that of a sweep, in a real browser."""
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -48,19 +49,6 @@ def test_the_contents_stay_in_sight_wherever_one_reads(page, tab):
         assert tab.evaluate("document.querySelector('.contents > details').open") == (width == 1400)
 
 
-def test_no_page_is_wider_than_a_phone(page, tab):
-    tab.open(page, width=420)
-    tab.draw_all()
-    assert tab.evaluate("document.documentElement.scrollWidth") <= 420
-    wider = (
-        "[...document.querySelectorAll('main *')].filter(one => one.getBoundingClientRect().right > innerWidth"
-        " && !one.closest('.wide')).map(one => one.outerHTML.slice(0, 200))"
-    )
-    assert tab.evaluate(wider) == []
-    narrow = "[...document.querySelectorAll('[data-plot]')].filter(one => !one.style.minWidth)"
-    assert max(tab.evaluate(f"{narrow}.map(one => one.layout.width)")) <= 420
-
-
 CONTRAST = """
 (() => {
   const shine = (color) => {
@@ -89,17 +77,80 @@ CONTRAST = """
 """
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_words_of_page_and_figures_can_be_read_in_light_and_in_the_dark(page, tab, scheme):
+@dataclass(frozen=True)
+class Drawn:
+    """A page with all its figures, as a reader sees it."""
+
+    background: str
+    contrasts: dict[str, float]
+    """Of what is to be read, by element, its colour and what is behind it."""
+    width: float
+    wider: list[str]
+    """Elements that reach beyond the window."""
+    widest_figure: float
+    """Of those that cannot be scrolled by themselves."""
+    states: set[str]
+    complaints: list[str]
+    asked_for: set[str]
+
+
+WIDER = (
+    "[...document.querySelectorAll('main *')].filter(one => one.getBoundingClientRect().right > innerWidth"
+    " && !one.closest('.wide')).map(one => one.outerHTML.slice(0, 200))"
+)
+NARROW = "[...document.querySelectorAll('[data-plot]')].filter(one => !one.style.minWidth)"
+
+
+def draw(tab, page: Path, scheme: str, width: int) -> Drawn:
+    tab.renew()
     tab.prefer(scheme)
-    tab.open(page)
+    tab.open(page, width=width)
     tab.draw_all()
-    background = tab.evaluate("getComputedStyle(document.body).backgroundColor")
-    assert (max(map(int, re.findall(r"\d+", background))) < 60) == (scheme == "dark")
-    found = tab.evaluate(CONTRAST)
-    assert any(name.startswith("text ") for name in found)
-    # WCAG 2.2, 1.4.3; it leaves out what is not text to read.
-    assert {name: ratio for name, ratio in found.items() if ratio < 4.5} == {}
+    return Drawn(
+        background=tab.evaluate("getComputedStyle(document.body).backgroundColor"),
+        contrasts=tab.evaluate(CONTRAST),
+        width=tab.evaluate("document.documentElement.scrollWidth"),
+        wider=tab.evaluate(WIDER),
+        widest_figure=max(tab.evaluate(f"{NARROW}.map(one => one.layout.width)")),
+        states=set(
+            tab.evaluate("[...document.querySelectorAll('[data-plot]')].map(one => one.dataset.state)")
+        ),
+        complaints=tab.complaints,
+        asked_for=tab.asked_for,
+    )
+
+
+@pytest.fixture(scope="module")
+def on_phone(page, chromium) -> Drawn:
+    """The page by day on a phone: drawing all figures takes seconds."""
+    return draw(chromium, page, "light", 420)
+
+
+@pytest.fixture(scope="module")
+def on_screen(page, chromium) -> Drawn:
+    """The page by night on a screen."""
+    return draw(chromium, page, "dark", 1400)
+
+
+def test_no_page_is_wider_than_a_phone(on_phone):
+    assert on_phone.width <= 420
+    assert on_phone.wider == []
+    assert on_phone.widest_figure <= 420
+
+
+def test_every_figure_is_drawn_without_a_complaint_and_nothing_is_asked_for(on_phone, on_screen):
+    for seen in (on_phone, on_screen):
+        assert seen.states == {"drawn"}
+        assert seen.complaints == []
+        assert seen.asked_for <= {"file", "data", "blob"}
+
+
+def test_words_of_page_and_figures_can_be_read_in_light_and_in_the_dark(on_phone, on_screen):
+    for seen, is_dark in ((on_phone, False), (on_screen, True)):
+        assert (max(map(int, re.findall(r"\d+", seen.background))) < 60) == is_dark
+        assert any(name.startswith("text ") for name in seen.contrasts)
+        # WCAG 2.2, 1.4.3; it leaves out what is not text to read.
+        assert {name: ratio for name, ratio in seen.contrasts.items() if ratio < 4.5} == {}
 
 
 def test_figures_follow_when_the_reader_goes_from_light_to_dark(page, tab):
