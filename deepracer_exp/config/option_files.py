@@ -32,6 +32,7 @@ from .overrides import may_be_new, override_line
 from .track_options import BASE, world_values
 from .track_options import GROUP as TRACK
 
+_OPTION = "an option file with lines KEY: VALUE"
 _EMPTY = str(Path(__file__).parent)
 _PACKAGE = re.compile(r"(?:\s*#.*\n)*?\s*#\s*@package\s+(\S+)")
 
@@ -78,7 +79,7 @@ class OptionFiles(ConfigSource):
                 config = track_values(option, config)
             return ConfigResult(self.provider, self.full_path(), config, {"package": package and package[1]})
 
-        return read_yaml(self._file(config_path), "an option file with lines KEY: VALUE", load)
+        return read_yaml(self._file(config_path), _OPTION, load)
 
     def is_config(self, config_path: str) -> bool:
         """Return whether there is such an option; a pipe or a broken link is refused when it is read."""
@@ -168,9 +169,28 @@ def composed_option(group: str, option: str) -> DictConfig:
     """Return the values of an option by itself; raises as `composed`."""
     if (world := _world(group, option)) is not None:
         return track_values(option, world)
-    values = composed(None, [f"+{override_line(group, option)}"])[0][group]
+    config = _alone(group, option) or composed(None, [f"+{override_line(group, option)}"])[0]
+    values = config[group]
     assert isinstance(values, DictConfig)
     return values
+
+
+def _alone(group: str, option: str) -> DictConfig | None:
+    """Return what Hydra would compose of an option that names no other, in a hundredth of the time; None: ask it."""
+    if group == TRACK:  # which has values of its own for missing keys
+        return None
+    path = next(
+        (path for folder in conf_dirs() if (path := Path(folder, group, f"{option}.yaml")).is_file()), None
+    )
+    if path is None:
+        return None
+
+    def load(text: str) -> DictConfig | None:
+        config = copy.deepcopy(_parsed(text))
+        needs_hydra = "defaults" in config or _PACKAGE.match(text) is not None
+        return None if needs_hydra else OmegaConf.create({group: config})
+
+    return read_yaml(path, _OPTION, load)
 
 
 def change(config: DictConfig, override: Override) -> bool:
