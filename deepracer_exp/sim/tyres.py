@@ -86,7 +86,7 @@ def car_record(car: CarConfig) -> Cars:
     return record
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, error_model="numpy", inline="always")
 def _grip(stiffness, limit, slip):  # type: ignore[no-untyped-def]
     """Return the force of a tyre per slip velocity, N s/m, along or across the wheel.
 
@@ -102,7 +102,7 @@ def _grip(stiffness, limit, slip):  # type: ignore[no-untyped-def]
     return 2.0 / np.pi * stiffness * (np.arccos(share) + (1.0 - np.sqrt(1.0 - share * share)) / share)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def tyre_forces(car, drive, ahead_mps, left_mps, rate_radps, dt_s):  # type: ignore[no-untyped-def]
     """Return the force of the floor on one car during a physics step, and update the speeds of its wheels.
 
@@ -194,7 +194,7 @@ def tyre_forces(car, drive, ahead_mps, left_mps, rate_radps, dt_s):  # type: ign
     )
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def send(car, drive, speed_mps, steering_rad, step, steps, dt_s):  # type: ignore[no-untyped-def]
     """Advance a car's steering, and the command that its motors follow, by one physics step.
 
@@ -220,7 +220,7 @@ def send(car, drive, speed_mps, steering_rad, step, steps, dt_s):  # type: ignor
     )
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def push_cars(cars, drives, yaw_rad, velocity, commands, step, steps, dt_s, forces):  # type: ignore[no-untyped-def]
     """Compute the forces on all cars for one physics step of a control period.
 

@@ -15,11 +15,13 @@ from deepracer_exp.env.trace import (
     EPISODE_STATUS,
     PACKED,
     PACKED_COLUMNS,
+    RANDOMIZED,
     SCHEMA,
     STATUS_CODE,
     TRACE_COLUMNS,
     to_table,
 )
+from deepracer_exp.env.trace_rows import row_dtype
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.runs.trace import DECIMALS, MOST_ROWS, TraceWriter, read_trace
 from tests.conftest import REFERENCE, refused
@@ -214,3 +216,16 @@ def test_a_folder_without_a_trace_is_named(tmp_path: Path) -> None:
     for folder in (tmp_path, tmp_path / "none"):
         with pytest.raises(BadInput, match=r"accepted: the folder of a run with its trace"):
             read_trace(folder)
+
+
+def test_the_records_that_a_race_writes_are_the_packed_columns_in_their_order():
+    extra = ("own_episode", "bots_stopped")
+    records = row_dtype(extra)
+    assert records.itemsize == 8 * (len(PACKED) + len(extra))
+    places = {name: kind[1] // 8 for name, kind in records.fields.items()}
+    randomized = places.pop("randomized")
+    expected = {**PACKED, **{name: len(PACKED) + number for number, name in enumerate(extra)}}
+    assert [expected.pop(name) for name in RANDOMIZED] == list(
+        range(randomized, randomized + len(RANDOMIZED))
+    )
+    assert places == expected
