@@ -101,8 +101,9 @@ class Measures:
 
     def replace(self, ids: NDArray[np.intp], those: "Measures") -> None:
         """Replace the rows of the cars `ids` by those of `those`."""
-        for field in fields(self):
-            getattr(self, field.name)[ids] = getattr(those, field.name)
+        mine, others = vars(self), vars(those)
+        for name, values in mine.items():
+            values[ids] = others[name]
 
 
 @compiled

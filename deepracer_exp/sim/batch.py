@@ -94,12 +94,10 @@ class CarBatch:
 
         The cars are distinct; position of the chassis origin and heading are (n,) each.
         """
-        com = self.car.com_x_m
-        self._rows[ids] = self._rest_row
-        # The joints move the centre of mass, from where it is when the chassis origin is at the world's.
-        self._qpos[ids, 0] = x_m + com * (np.cos(yaw_rad) - 1.0)
-        self._qpos[ids, 1] = y_m + com * np.sin(yaw_rad)
-        self._qpos[ids, 2] = yaw_rad
+        ids = np.reshape(ids, -1)
+        pose = np.empty((3, len(ids)))
+        pose[0], pose[1], pose[2] = x_m, y_m, yaw_rad
+        _place(ids, pose, self.car.com_x_m, self._rest_row, self._rows, self._qpos)
 
     @property
     def acceleration_mps2(self) -> Floats:
@@ -211,6 +209,18 @@ def _limit(commands, moving, min_mps, max_mps, max_rad):  # type: ignore[no-unty
     for car in range(len(commands)):
         commands[car, 0] = min(max(commands[car, 0], min_mps), max_mps) * moving[car]
         commands[car, 1] = min(max(commands[car, 1], -max_rad), max_rad) * moving[car]
+
+
+@njit(cache=True, nogil=True)
+def _place(ids, pose, com_m, rest, rows, qpos):  # type: ignore[no-untyped-def]
+    """Put the cars `ids` at rest, at x, y and yaw (3, n), in the states `rows`, of which `qpos` is a part."""
+    for i in range(len(ids)):
+        car, yaw = ids[i], pose[2, i]
+        rows[car] = rest
+        # The joints move the centre of mass, from where it is when the chassis origin is at the world's.
+        qpos[car, 0] = pose[0, i] + com_m * (math.cos(yaw) - 1.0)
+        qpos[car, 1] = pose[1, i] + com_m * math.sin(yaw)
+        qpos[car, 2] = yaw
 
 
 @njit(cache=True, nogil=True)
