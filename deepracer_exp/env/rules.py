@@ -414,11 +414,6 @@ class RaceRules:
             "previous_progress": result.previous_progress,
         }
 
-    def nearer_waypoint(self) -> np.ndarray:
-        """Return the nearer of the two closest waypoints, the one behind where they are equally far, (N,)."""
-        now, (waypoints, first) = self.now, self.tracks.waypoints
-        return np.asarray(_nearer(now.closest_waypoints, now.front, waypoints, first, self.track_index))
-
 
 def wheels_on_road(
     tracks: Tracks, track_index: Ids, x_m: Floats, y_m: Floats, yaw_rad: Floats, wheels_m: ArrayLike
@@ -574,13 +569,17 @@ def _ends(status, track_index, closed, lap_terminates, endings):  # type: ignore
 
 
 @compiled
-def _nearer(closest, front, waypoints, first, track_index):  # type: ignore[no-untyped-def]
-    """Return the nearer of two waypoints for each car, see `RaceRules.nearer_waypoint`."""
-    nearer = np.empty(len(front), np.int64)
-    for car in range(len(front)):
-        behind, ahead = closest[car, 0], closest[car, 1]
-        at, x, y = first[track_index[car]], front[car, 0], front[car, 1]
-        behind_m = math.hypot(waypoints[at + behind, 0] - x, waypoints[at + behind, 1] - y)
-        ahead_m = math.hypot(waypoints[at + ahead, 0] - x, waypoints[at + ahead, 1] - y)
-        nearer[car] = ahead if ahead_m < behind_m else behind
-    return nearer
+def nearer_of(closest, front, waypoints, first):  # type: ignore[no-untyped-def]
+    """Return which of the two waypoints around a car is nearer to its front, the one behind if both are equally far.
+
+    Args:
+        closest: the waypoint behind and the one ahead, (2,).
+        front: front point, (2,).
+        waypoints: of all courses, see `Tracks.waypoints`.
+        first: where those of the car's course begin among them.
+    """
+    behind, ahead = closest[0], closest[1]
+    at_behind, at_ahead = waypoints[first + behind], waypoints[first + ahead]
+    behind_m = math.hypot(at_behind[0] - front[0], at_behind[1] - front[1])
+    ahead_m = math.hypot(at_ahead[0] - front[0], at_ahead[1] - front[1])
+    return ahead if ahead_m < behind_m else behind

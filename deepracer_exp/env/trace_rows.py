@@ -7,6 +7,7 @@ import numpy as np
 
 from deepracer_exp.tracks.segments import compiled
 
+from .rules import nearer_of
 from .trace import PACKED_COLUMNS, RANDOMIZED
 
 
@@ -39,7 +40,9 @@ def write_rows(  # type: ignore[no-untyped-def]
     truncated,
     all_wheels_on_track,
     progress,
-    closest_waypoint,
+    closest_waypoints,
+    waypoints,
+    first_waypoint,
     length_m,
     course,
     track_index,
@@ -53,8 +56,9 @@ def write_rows(  # type: ignore[no-untyped-def]
     """Write the columns of a control step; those that are not named stay as they are.
 
     `rows` are `row_dtype` records, (N,), whose columns are those of `trace.PACKED_COLUMNS`. Front points are (N, 2),
-    commanded steering and speed (N,), numbers of actions float64, NaN for a continuous space, lengths those of the
-    tracks, (W,), and randomized quantities those of `trace.RANDOMIZED`, (N, Q); the rest is (N,).
+    closest waypoints (N, 2), waypoints those of `Tracks.waypoints`, commanded steering and speed (N,), numbers of
+    actions float64, NaN for a continuous space, lengths those of the tracks, (W,), and randomized quantities those of
+    `trace.RANDOMIZED`, (N, Q); the rest is (N,).
     """
     for car in range(len(rows)):
         row = rows[car]
@@ -64,7 +68,9 @@ def write_rows(  # type: ignore[no-untyped-def]
         row.reward, row.episode_return = reward[car], episode_return[car]
         row.done = terminated[car] or truncated[car]
         row.all_wheels_on_track = all_wheels_on_track[car]
-        row.progress, row.closest_waypoint = progress[car], closest_waypoint[car]
+        first = first_waypoint[track_index[car]]
+        row.closest_waypoint = nearer_of(closest_waypoints[car], front[car], waypoints, first)
+        row.progress = progress[car]
         row.track_len, row.track = length_m[track_index[car]], course[car]
         row.tstamp = clock_steps[car] * period_s
         row.episode_status, row.speed_mps = status[car], measured_mps[car]

@@ -120,9 +120,9 @@ class CarBatch:
         """
         commands = self._commands
         commands[:, 0], commands[:, 1] = speed_mps, steering_rad
-        _require_finite("command", commands)
         moving = self._all_move if moving is None else moving
-        _limit(commands, moving, self.car.min_speed_mps, self.car.max_speed_mps, self._max_steering_rad)
+        min_mps, max_mps = self.car.min_speed_mps, self.car.max_speed_mps
+        _refuse("command", _limit(commands, moving, min_mps, max_mps, self._max_steering_rad))
         steps, dt_s = self.car.substeps, self.model.opt.timestep
         for step in range(steps):
             yaw = self._qpos[:, 2]
@@ -131,7 +131,7 @@ class CarBatch:
                 self._batch.step()
             except mujoco.batch.SimulationError as error:
                 raise RunFailed(f"car {int(error.ids[0])}: {error}") from error
-        _require_finite("physics state", self._moving)
+        _refuse("physics state", _first_lost(self._moving))
 
     def read(self, ids: Ids | None = None) -> CarState:
         """Return position and motion of the cars `ids`, (n,) each; None: of all."""
@@ -186,9 +186,8 @@ class CarBatch:
         self._cars["speed_delay"][ids] = speed_delay_s * self.car.control_hz
 
 
-def _require_finite(what: str, values: Floats) -> None:
-    """Raise RunFailed for the first car, (N, k), of which a number is not finite."""
-    car = _first_lost(values)
+def _refuse(what: str, car: int) -> None:
+    """Raise RunFailed for a car of which a number is not finite; -1 is none."""
     if car >= 0:
         raise RunFailed(f"car {car}: {what} is not finite")
 
@@ -205,10 +204,17 @@ def _first_lost(values):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _limit(commands, moving, min_mps, max_mps, max_rad):  # type: ignore[no-untyped-def]
-    """Clip commanded speeds and angles in place, (N, 2), and make them zero for cars that are not moving, (N,)."""
+    """Clip commanded speeds and angles in place, (N, 2), and make them zero for cars that are not moving, (N,).
+
+    Returns the first car of which a command is not finite, -1 if there is none.
+    """
     for car in range(len(commands)):
-        commands[car, 0] = min(max(commands[car, 0], min_mps), max_mps) * moving[car]
-        commands[car, 1] = min(max(commands[car, 1], -max_rad), max_rad) * moving[car]
+        speed_mps, steering_rad = commands[car, 0], commands[car, 1]
+        if not (math.isfinite(speed_mps) and math.isfinite(steering_rad)):
+            return car
+        commands[car, 0] = min(max(speed_mps, min_mps), max_mps) * moving[car]
+        commands[car, 1] = min(max(steering_rad, -max_rad), max_rad) * moving[car]
+    return -1
 
 
 @njit(cache=True, nogil=True)

@@ -6,7 +6,7 @@ import pytest
 
 from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.env.rules import RaceRules
+from deepracer_exp.env.rules import RaceRules, nearer_of
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.env.trace import EPISODE_STATUS
 from deepracer_exp.rewards.reward import RewardFunction
@@ -62,13 +62,14 @@ def judged(rows: pd.DataFrame, setup) -> pd.DataFrame:
         paid = reward(
             rules.params(result, np.zeros(cars), np.zeros(cars)), rules.track_params, result.running
         )
+        closest, waypoints = (result.now.closest_waypoints, result.now.front), rules.tracks.waypoints[0]
         out[at] = np.column_stack(
             [
                 result.progress,
                 result.all_wheels_on_track,
                 result.status,
                 result.terminated | result.truncated,
-                rules.nearer_waypoint(),
+                [nearer_of(*around, waypoints, 0) for around in zip(*closest, strict=True)],
                 paid,
                 rules.steps,
             ]
