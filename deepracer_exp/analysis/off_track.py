@@ -167,9 +167,9 @@ def _stretches(steps: pd.DataFrame) -> tuple[Values, Values, Values]:
     )
     # A command acts until the next row.
     commanded = np.degrees(_before(speed, 1) * np.tan(np.radians(_before(steer, 1))) / WHEELBASE_M)
-    inside = since >= 2
-    columns = np.column_stack([_before(rate, 1), commanded, np.ones(len(rate))])
-    lag, gain, trim = np.linalg.lstsq(columns[inside], rate[inside], rcond=None)[0]
+    # Least squares by the normal equations: three unknowns, of millions of rows.
+    columns = np.stack([_before(rate, 1), commanded, np.ones(len(rate))]) * (since >= 2)
+    lag, gain, trim = np.linalg.lstsq(columns @ columns.T, columns @ rate, rcond=None)[0]
     predicted, more, mean_steer = _before(rate, BEFORE), np.zeros(len(rate)), np.zeros(len(rate))
     slide = np.abs(np.nan_to_num(steps["slide_deg"].to_numpy(np.float64)))
     largest = slide.copy()
