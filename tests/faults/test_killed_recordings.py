@@ -9,7 +9,6 @@ import pytest
 from mlflow import MlflowClient
 
 from deepracer_exp.tracking.metrics import metric_name
-from tests.waiting import wait_until
 
 
 @pytest.mark.slow
@@ -33,11 +32,19 @@ def test_a_recording_killed_again_and_again_leaves_every_point_once(tmp_path):
 
 
 _CREATES = """
-import pathlib, sys
+import pathlib, sys, time
 from deepracer_exp.tracking.mlflow_run import MLflowRun
 from deepracer_exp.tracking.store import resolve_store
 
-print("begins", flush=True)
+replace = pathlib.Path.replace
+
+def wait_to_be_killed(path, target):
+    if target.name == "mlflow.db" and "killed" in sys.argv:
+        print("made", flush=True)
+        time.sleep(600)
+    return replace(path, target)
+
+pathlib.Path.replace = wait_to_be_killed
 MLflowRun(resolve_store(None, pathlib.Path(sys.argv[1])))
 """
 
@@ -45,12 +52,12 @@ MLflowRun(resolve_store(None, pathlib.Path(sys.argv[1])))
 @pytest.mark.slow
 def test_a_store_whose_creation_was_killed_is_created_again(tmp_path):
     command = [sys.executable, "-c", _CREATES, str(tmp_path)]
-    killed = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    killed = subprocess.Popen([*command, "killed"], stdout=subprocess.PIPE, text=True)
     assert killed.stdout is not None
-    killed.stdout.readline()
-    wait_until(lambda: list(tmp_path.glob(".mlflow.db.new*")), "new store")
+    assert killed.stdout.readline() == "made\n"
     killed.kill()
     killed.wait()
+    assert list(tmp_path.glob(".mlflow.db.new*"))
     assert not (tmp_path / "mlflow.db").exists()
     subprocess.run(command, check=True, capture_output=True)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mlflow.db", "mlflow.db.lock"]

@@ -1,11 +1,16 @@
+import contextlib
+import sqlite3
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+from mlflow import MlflowClient
 
 from deepracer_exp.config.running import MLflowTracking
 from deepracer_exp.errors import BadInput
 from deepracer_exp.tracking.loggers import open_tracker
+from deepracer_exp.tracking.mlflow_run import MLflowRun
 from deepracer_exp.tracking.store import resolve_store
 from tests.conftest import refused
 
@@ -70,3 +75,19 @@ def test_a_store_is_the_one_that_a_run_names_by_whichever_path_and_after_a_move(
     (tmp_path / "before").mkdir()
     (tmp_path / "before" / "mlflow.db").touch()
     assert not store.is_named(f"sqlite:///{tmp_path}/before/mlflow.db")
+
+
+def _tables(file: Path) -> list[tuple]:
+    """Return how the tables of a store were made, their version, and the experiments' names."""
+    with contextlib.closing(sqlite3.connect(file)) as database:
+        made = "SELECT name, sql FROM sqlite_master WHERE sql NOT NULL ORDER BY name"
+        version, names = "SELECT * FROM alembic_version", "SELECT experiment_id, name FROM experiments"
+        return [row for query in (made, version, names) for row in database.execute(query)]
+
+
+def test_a_store_copied_from_an_empty_one_is_what_mlflow_makes(tmp_path):
+    MlflowClient(tracking_uri=f"sqlite:///{tmp_path}/its_own.db").search_experiments()
+    folders = [tmp_path / "first", tmp_path / "second"]
+    for folder in folders:  # the second one is a copy, even if this installation has never made a store
+        MLflowRun(resolve_store(None, folder))
+        assert _tables(folder / "mlflow.db") == _tables(tmp_path / "its_own.db")
