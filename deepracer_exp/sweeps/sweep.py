@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import optuna
+from numpy.typing import NDArray
 from optuna.storages import RDBStorage
 from optuna.study import Study
 from optuna.trial import FrozenTrial
 from rich.console import Console
 
-from deepracer_exp.analysis.statistics import Values
 from deepracer_exp.config import acting
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.experiment import Experiment
@@ -353,7 +353,7 @@ def interval_of(evaluations: Sequence[Evaluation], objective: str, trial_time_s:
 
 def _draws(
     groups: Sequence[TrialGroup], objective: str, trial_time_s: float, rng: np.random.Generator
-) -> Values:
+) -> NDArray[np.float64]:
     """Return the objective's value on one track in each resample, (n,)."""
     if objective == "zigzag":
         return _zigzag_draws(groups, rng)
@@ -365,7 +365,7 @@ def _draws(
     return np.where(laps > 0, time_s / np.maximum(laps, 1), fallback)
 
 
-def _zigzag_draws(groups: Sequence[TrialGroup], rng: np.random.Generator) -> Values:
+def _zigzag_draws(groups: Sequence[TrialGroup], rng: np.random.Generator) -> NDArray[np.float64]:
     """Return changes of steering a metre in each resample of the trials, (n,)."""
     zigzags = [zigzag for group in groups for zigzag in group.zigzags]
     sums = np.array([(zigzag.changes, zigzag.straight_m) for zigzag in zigzags]).T
@@ -373,7 +373,7 @@ def _zigzag_draws(groups: Sequence[TrialGroup], rng: np.random.Generator) -> Val
     return changes / np.maximum(straight_m, 1.0)
 
 
-def _resampled(group: TrialGroup, objective: str, rng: np.random.Generator) -> Values:
+def _resampled(group: TrialGroup, objective: str, rng: np.random.Generator) -> NDArray[np.float64]:
     """Return laps tried, complete laps, counted time and progress in each resample of the trials, (4, n)."""
     column = {trial: place for place, trial in enumerate(group.trials)}
     sums = np.zeros((4, len(column)))
