@@ -187,7 +187,7 @@ def test_what_is_left_out_is_reported(run, ours, exported):
 
 
 def test_a_continuous_policy_with_lidar_writes_its_commands_and_sensors(trained, export, caplog):
-    run = trained(*LONGER[:-1], "observation=lidar")
+    run = trained("algorithm.frames_per_iteration=2048", "budget.env_steps=4096", "observation=lidar")
     folder, _ = export(run.folder, "deepracer-for-cloud")
     theirs = loaded(folder, "deepracer-for-cloud", caplog).dataframe()
     assert set(theirs["action"]) == {-1}

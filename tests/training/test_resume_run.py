@@ -66,7 +66,7 @@ def whole(trained, *overrides):
         ),
         (
             *("observation=camera_small", "observation.camera.frames=2", "randomization=sim2real"),
-            "algorithm.frames_per_iteration=256",
+            *("collector.cars=4", "algorithm.batch_size=64", "algorithm.frames_per_iteration=128"),
         ),
         ("observation=lidar", "randomization=sim2real"),
         (
@@ -124,7 +124,7 @@ def test_past_a_damaged_best_checkpoint_a_later_one_becomes_the_best(cut, call):
     best, last = (run / "checkpoints" / name for name in ("best", "last"))
     iterations = 4
     while iterations == 4 or best.resolve() == last.resolve():  # until the newest policy is not the best one
-        iterations += 1
+        iterations += 2
         ended = call("resume", run.name, f"budget.iterations={iterations}")
         assert ended.code == 0, ended.stderr
     best = best.resolve()

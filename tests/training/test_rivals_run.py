@@ -18,7 +18,7 @@ OFTEN = (
     "checkpoints.every=2",
     "algorithm.frames_per_iteration=512",
 )
-SIX, THREE = (("budget.env_steps=null", f"budget.iterations={count}") for count in (6, 3))
+SIX, FOUR, THREE = (("budget.env_steps=null", f"budget.iterations={count}") for count in (6, 4, 3))
 
 
 def snapshots(run) -> list[int]:
@@ -38,7 +38,7 @@ def test_the_rival_decides_what_is_learned(trained):
     losses = []
     for policy in ("newest", "pool"):
         run = trained(
-            *RACE, *OFTEN, *SIX, "race.rivals.snapshot_every=1", f"race.rivals.policy={policy}"
+            *RACE, *OFTEN, *FOUR, "race.rivals.snapshot_every=1", f"race.rivals.policy={policy}"
         ).folder
         losses.append([row["policy_loss"] for row in read_metrics(run / "metrics.jsonl")])
     # Up to the first iteration with two snapshots, and from then on.
@@ -56,7 +56,7 @@ def test_rivals_reach_the_workers_and_a_resumed_run_of_several_is_the_uninterrup
         (config,) = (tmp_path / "runs" / name).glob("*/config.yaml")
         return config.parent
 
-    whole, run = trained_by_two("whole", *THREE[:1], "budget.iterations=4"), trained_by_two("half", *THREE)
+    whole, run = trained_by_two("whole", *FOUR), trained_by_two("half", *THREE)
     ended = call("resume", run.name, "budget.iterations=4")
     assert ended.code == 0, ended.stderr
     rows = [
