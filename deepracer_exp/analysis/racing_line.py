@@ -97,23 +97,23 @@ def bounded_least_squares(
     # Where values can change together at no cost, as along a straight, they stay.
     product[np.diag_indices_from(product)] *= 1.0 + 1e-12
     low, high = bounds
-    found = np.clip(start, low, high)
+    solution = np.clip(start, low, high)
     for _ in range(_MOST_STEPS):
-        slope = product @ found + slope_at_0
-        held = ((found <= low) & (slope > 0.0)) | ((found >= high) & (slope < 0.0))
+        slope = product @ solution + slope_at_0
+        held = ((solution <= low) & (slope > 0.0)) | ((solution >= high) & (slope < 0.0))
         free = np.flatnonzero(~held)
-        step = np.zeros(len(found))
+        step = np.zeros(len(solution))
         step[free] = np.linalg.solve(product[np.ix_(free, free)], -slope[free])
-        before, share = found, 1.0
+        before, share = solution, 1.0
         while share > _EXACT_M:
-            found = np.clip(before + share * step, low, high)
-            moved = found - before
+            solution = np.clip(before + share * step, low, high)
+            moved = solution - before
             if slope @ moved + 0.5 * moved @ product @ moved <= _DESCENT * slope @ moved:
                 break
             share /= 2.0
-        if np.abs(found - before).max() < _EXACT_M:
+        if np.abs(solution - before).max() < _EXACT_M:
             break
-    return found
+    return solution
 
 
 def _places(course: Track) -> Values:

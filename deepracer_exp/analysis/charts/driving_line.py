@@ -159,12 +159,12 @@ def racing_line(view: LogView) -> Chart | None:
         return None
     columns = ("closest_waypoint", "lap_position", "offset_m", "X", "Y")
     rows, which = _laps_or_recent(view, *columns)
-    known = np.flatnonzero(np.isfinite(rows["offset_m"].to_numpy()))
-    if not len(known):
+    placed = np.flatnonzero(np.isfinite(rows["offset_m"].to_numpy()))
+    if not len(placed):
         return None
     ideal, n = minimum_curvature_line(course), view.waypoint_count
     x = np.arange(n)
-    rows = rows.iloc[known[subsample(len(known), MOST_ROWS)]]
+    rows = rows.iloc[placed[subsample(len(placed), MOST_ROWS)]]
     waypoint = closest_waypoints(rows)
     away_m = rows["offset_m"] - ideal.interpolate(rows["lap_position"], ideal.offset_m)
     low, middle, high = quantiles(waypoint, away_m, n, (0.1, 0.5, 0.9))

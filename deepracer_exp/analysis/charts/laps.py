@@ -253,8 +253,8 @@ def correlations(view: LogView) -> Chart | None:
     for name in r.index[:_MOST_PANELS]:
         layers: list[Layer] = [points(shown[name], shown["lap_time_s"], BLUE, size=5)]
         values = laps[name].to_numpy(np.float64)
-        known, distinct = np.isfinite(values), laps[name].nunique()
-        values, times_s = values[known], lap_s[known]
+        is_finite, distinct = np.isfinite(values), laps[name].nunique()
+        values, times_s = values[is_finite], lap_s[is_finite]
         for degree, color in ((1, VERMILION), (2, ORANGE)):
             if len(values) >= _FITTED and distinct > degree + 1:
                 low, high = np.quantile(values, [0.005, 0.995]).tolist()

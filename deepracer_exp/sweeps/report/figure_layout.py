@@ -178,6 +178,8 @@ def _write_choices(axis: Axis, panel_width: float) -> None:
     axis |= {
         "range": [-0.5, len(choices) - 0.5],
         "tickvals": axis["categoryarray"],
-        "ticktext": [wrapped(one, width) if upright else plain(one, LONGEST_CHOICE) for one in choices],
+        "ticktext": [
+            wrapped(choice, width) if upright else plain(choice, LONGEST_CHOICE) for choice in choices
+        ],
         "tickangle": 0 if upright else -90,
     }
