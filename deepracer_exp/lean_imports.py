@@ -1,7 +1,4 @@
-"""PyTorch and TorchRL without what a training never uses of them: the compiler, tensors without values, and Ray.
-
-They are half of the seconds of the import.
-"""
+"""TorchRL without what a command never uses of it: PyTorch's compiler and Ray, half of the seconds of its import."""
 
 import contextlib
 import gc
@@ -19,14 +16,6 @@ _USED = ("checkpoint", "collectors", "data", "envs", "modules", "objectives", "w
 """Modules of TorchRL that are imported with it."""
 _COMPILER = "torch._dynamo"
 _RAY = "ray"
-_META = "torch._meta_registrations"
-_AFTER_META = (
-    "torch._dynamo",
-    "torch._inductor",
-    "torch._functorch.aot_autograd",
-    "torch.utils._content_store",
-)
-"""Modules that are whole only if `_META` was imported before them."""
 _RARELY = 400_000
 """New objects between two collections of garbage. Imports make half a million, of which none is garbage; at Python's
 usual 700, looking at them again and again takes a fifth of the imports' time."""
@@ -35,10 +24,7 @@ _OPTIMIZER_METHODS = ("add_param_group", "load_state_dict", "state_dict", "zero_
 
 
 def import_lean() -> None:
-    """Have PyTorch and TorchRL imported without the compiler, its parts and Ray, when this process asks for them.
-
-    PyTorch itself loads a large part of its compiler: how operators work on tensors without values ("meta"). It is
-    loaded before the real compiler; what else computes with such tensors imports `torch._meta_registrations`.
+    """Have TorchRL imported without PyTorch's compiler and Ray, when this process first asks for it.
 
     TorchRL marks functions for the compiler, which loads all of it, and looks whether Ray is installed by importing it.
     A program that compiles loads the real compiler later; functions of TorchRL lack their marks there, and are run as
@@ -49,21 +35,8 @@ def import_lean() -> None:
         gc.set_threshold(_RARELY)
 
 
-@contextlib.contextmanager
-def not_imported(package: str) -> Iterator[None]:
-    """Have a package not imported within the block, as if it were not installed; of no effect where it is already."""
-    if package in sys.modules:
-        yield
-        return
-    sys.modules[package] = None  # type: ignore[assignment]
-    try:
-        yield
-    finally:
-        del sys.modules[package]
-
-
 class _LeanTorchRL(MetaPathFinder):
-    """Finds PyTorch, and the first module of TorchRL, with which it imports the others."""
+    """Finds the first module of TorchRL, and imports the others with it."""
 
     def __init__(self, garbage_threshold: tuple[int, ...]):
         """Set `garbage_threshold` for collections of garbage once TorchRL is imported."""
@@ -72,29 +45,13 @@ class _LeanTorchRL(MetaPathFinder):
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        if fullname not in ("torch", *_FIRST):
+        if fullname not in _FIRST:
             return None
+        sys.meta_path.remove(self)
         spec = PathFinder.find_spec(fullname, path)
         if spec is None or spec.loader is None:
             return None
         execute = spec.loader.exec_module
-
-        def execute_without_meta(module: ModuleType) -> None:
-            sys.modules[_META] = ModuleType(_META)
-            try:
-                execute(module)
-            finally:
-                del sys.modules[_META]
-            sys.meta_path.insert(0, _MetaFirst())
-            # What a generator of random numbers needs of the modules that were left out.
-            opaque = importlib.import_module("torch._opaque_base")
-            module._C._set_generator_metaclass(opaque.OpaqueBaseMeta)
-
-        if fullname == "torch":
-            spec.loader.exec_module = execute_without_meta  # type: ignore[method-assign]
-            return spec
-        importlib.import_module("torch")  # while this finder is there
-        sys.meta_path.remove(self)
 
         def execute_all(module: ModuleType) -> None:
             with _placeholders():
@@ -109,31 +66,23 @@ class _LeanTorchRL(MetaPathFinder):
         return spec
 
 
-class _MetaFirst(MetaPathFinder):
-    """Finds nothing, but imports `_META` before the first module that needs it."""
-
-    def find_spec(
-        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
-    ) -> ModuleSpec | None:
-        if fullname in _AFTER_META:
-            sys.meta_path.remove(self)
-            importlib.import_module(_META)
-        return None
-
-
 @contextlib.contextmanager
 def _placeholders() -> Iterator[None]:
     """Have PyTorch's compiler and Ray not imported within the block."""
     import torch
 
-    if _COMPILER not in sys.modules:
+    names = [name for name in (_COMPILER, _RAY) if name not in sys.modules]
+    if _COMPILER in names:
         sys.modules[_COMPILER] = torch._dynamo = _CompilerPlaceholder(_COMPILER)
+    if _RAY in names:
+        sys.modules[_RAY] = None  # type: ignore[assignment]
     try:
-        with not_imported(_RAY):
-            yield
+        yield
     finally:
         if isinstance(placeholder := sys.modules.get(_COMPILER), _CompilerPlaceholder):
             placeholder.remove()
+        if _RAY in names:
+            del sys.modules[_RAY]
 
 
 def _keep_lean() -> None:

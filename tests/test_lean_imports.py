@@ -8,7 +8,7 @@ import pytest
 
 from tests.conftest import IN_PROCESS
 
-UNUSED = ("torch._dynamo", "torch._inductor", "torch._meta_registrations", "torch._decomp", "sympy", "ray")
+UNUSED = ("torch._dynamo", "torch._inductor", "sympy", "ray")
 MEASURED_BY_CLOCK = ("wall_clock_s", "collect_s", "update_s", "env_steps_per_s")
 SCRIPT = f"""
 import gc, json, sys

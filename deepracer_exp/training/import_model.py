@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-import torch._meta_registrations  # for the device "meta", which commands import PyTorch without
 
 from deepracer_exp.agents.actor_critic import PolicyNetworks
 from deepracer_exp.agents.build import build_networks
