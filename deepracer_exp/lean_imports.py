@@ -35,6 +35,19 @@ def import_lean() -> None:
         gc.set_threshold(_RARELY)
 
 
+@contextlib.contextmanager
+def not_imported(package: str) -> Iterator[None]:
+    """Have a package not imported within the block, as if it were not installed; of no effect where it is already."""
+    if package in sys.modules:
+        yield
+        return
+    sys.modules[package] = None  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        del sys.modules[package]
+
+
 class _LeanTorchRL(MetaPathFinder):
     """Finds the first module of TorchRL, and imports the others with it."""
 
@@ -47,11 +60,12 @@ class _LeanTorchRL(MetaPathFinder):
     ) -> ModuleSpec | None:
         if fullname not in _FIRST:
             return None
-        sys.meta_path.remove(self)
         spec = PathFinder.find_spec(fullname, path)
         if spec is None or spec.loader is None:
             return None
         execute = spec.loader.exec_module
+
+        sys.meta_path.remove(self)
 
         def execute_all(module: ModuleType) -> None:
             with _placeholders():
@@ -71,18 +85,14 @@ def _placeholders() -> Iterator[None]:
     """Have PyTorch's compiler and Ray not imported within the block."""
     import torch
 
-    names = [name for name in (_COMPILER, _RAY) if name not in sys.modules]
-    if _COMPILER in names:
+    if _COMPILER not in sys.modules:
         sys.modules[_COMPILER] = torch._dynamo = _CompilerPlaceholder(_COMPILER)
-    if _RAY in names:
-        sys.modules[_RAY] = None  # type: ignore[assignment]
     try:
-        yield
+        with not_imported(_RAY):
+            yield
     finally:
         if isinstance(placeholder := sys.modules.get(_COMPILER), _CompilerPlaceholder):
             placeholder.remove()
-        if _RAY in names:
-            del sys.modules[_RAY]
 
 
 def _keep_lean() -> None:
