@@ -70,7 +70,7 @@ TRACKS = ("reinvent_base", "reInvent2019_track")
 WITHOUT: dict[str, list[str]] = {
     "smoothness": ["algorithm.smoothness=0.0"],
     "car": ["randomization=sim2real"],
-    "speeds": ["action_space.speed.low=1.0", "action_space.speed.high=4.0"],
+    "speeds": ["action_space=continuous"],
     "sim2real": ["randomization=none"],
 }
 """Overrides that leave an ingredient out."""

@@ -93,6 +93,13 @@ class Experiment:
                 f"stopping.evaluations={stopping.evaluations}: this training has no evaluations; accepted: null, or a "
                 "number of iterations for checkpoints.every"
             )
+        if isinstance(stopping, ReliableStopping) and stopping.held_out_completion is not None:
+            without = "stopping.evaluations=null" if not stopping.evaluations else "evaluation.held_out=null"
+            if not stopping.evaluations or self.evaluation.held_out is None:
+                raise ValueError(
+                    f"stopping.held_out_completion={stopping.held_out_completion:g}: no evaluation on held-out conditions "
+                    f"counts with {without}; accepted: null"
+                )
         imitates = isinstance(algorithm, PPOConfig) and algorithm.teacher_iterations > 0
         if self.teacher is None and imitates:
             raise ValueError("teacher: algorithm=distill needs one; accepted: teacher=RUN, a trained run")

@@ -20,12 +20,17 @@ class NoStopping:
 
 @dataclass(frozen=True, kw_only=True)
 class ReliableStopping:
-    """Stop once the car drives reliably: it completed a share of the last episodes, or of the last evaluated laps."""
+    """Stop once the car drives reliably: it completed a share of the last episodes, or of the last evaluated laps.
+
+    `held_out_completion`, per cent of the lap, is the mean that these evaluations must reach besides on conditions held
+    out of the training.
+    """
 
     kind: Literal["reliable"]
     lap_share: Fraction
     episodes: Count
     evaluations: Count | None = None
+    held_out_completion: Percent | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -122,8 +122,9 @@ class ReliableRule(StoppingRule):
 
     def __init__(self, config: ReliableStopping):
         self._config = config
-        self._evaluated: deque[tuple[int, int]] = deque(maxlen=config.evaluations)
-        """Complete laps of the last evaluations on the usual conditions, and those tried."""
+        self._evaluated: deque[tuple[int, int, float]] = deque(maxlen=config.evaluations)
+        """Complete laps of the last evaluations on the usual conditions, those tried, and the completion on held-out
+        ones."""
 
     def observe(self, row: Row) -> Decision | None:
         """Compare the share of complete laps."""
@@ -142,12 +143,19 @@ class ReliableRule(StoppingRule):
         config, tried = self._config, row.get("eval_laps_tried")
         if not tried:
             return None
-        self._evaluated.append((row["eval_laps"], tried))
-        laps, tried = (sum(column) for column in zip(*self._evaluated, strict=True))
+        self._evaluated.append((row["eval_laps"], tried, row.get("held_out_completion") or 0.0))
+        laps, tried, held_out = (sum(column) for column in zip(*self._evaluated, strict=True))
         if len(self._evaluated) != config.evaluations or laps < config.lap_share * tried:
             return None
         why = f"{laps} of {tried} laps of the last {count(len(self._evaluated), 'evaluation')} were complete"
-        return _decision("reliable", why, {"lap_share": laps / tried}, config)
+        values = {"lap_share": laps / tried}
+        if config.held_out_completion is not None:
+            completion = held_out / len(self._evaluated)
+            if completion < config.held_out_completion:
+                return None
+            why += f", and {completion:.0f}% of the way on held-out conditions"
+            values["held_out_completion"] = completion
+        return _decision("reliable", why, values, config)
 
 
 class TrendRule(StoppingRule):

@@ -285,6 +285,26 @@ def test_reliable_counts_the_laps_of_the_last_evaluations():
     assert stopped_at(list(map(row, laps[:-1])), of_three) == (None, None)
 
 
+def test_reliable_on_held_out_conditions_waits_for_them():
+    def row(held_out: float) -> dict:
+        return {"lap_share": 1.0, "eval_laps": 10, "eval_laps_tried": 10, "held_out_completion": held_out}
+
+    asked = ("stopping.evaluations=2", "stopping.held_out_completion=80", "evaluation.held_out=sim2real")
+    rows = list(map(row, [50.0, 90.0, 65.0, 94.0, 67.0]))
+    number, decision = stopped_at(rows, rule(*asked, option="reliable"))
+    assert number == len(rows)
+    assert str(decision) == (
+        "reliable: 20 of 20 laps of the last 2 evaluations were complete, and 80% of the way on held-out conditions"
+    )
+    assert stopped_at(rows[:-1], rule(*asked, option="reliable")) == (None, None)
+
+
+@pytest.mark.parametrize("left_out", ["stopping.evaluations=null", "evaluation.held_out=null"])
+def test_reliable_on_held_out_conditions_that_are_never_raced_is_refused(left_out):
+    with pytest.raises(BadInput, match=rf"stopping\.held_out_completion=80: .* with {left_out}"):
+        rule("stopping.held_out_completion=80", left_out, option="reliable_laps")
+
+
 def test_reliable_of_evaluations_that_are_never_made_is_refused():
     with pytest.raises(BadInput, match=r"stopping\.evaluations=4: this training has no evaluations"):
         rule("checkpoints.every=null", option="reliable_laps")
