@@ -97,8 +97,8 @@ class Experiment:
             without = "stopping.evaluations=null" if not stopping.evaluations else "evaluation.held_out=null"
             if not stopping.evaluations or self.evaluation.held_out is None:
                 raise ValueError(
-                    f"stopping.held_out_completion={stopping.held_out_completion:g}: no evaluation on held-out conditions "
-                    f"counts with {without}; accepted: null"
+                    f"stopping.held_out_completion={stopping.held_out_completion:g}: no evaluation on held-out "
+                    f"conditions counts with {without}; accepted: null"
                 )
         imitates = isinstance(algorithm, PPOConfig) and algorithm.teacher_iterations > 0
         if self.teacher is None and imitates:
