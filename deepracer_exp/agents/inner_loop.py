@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 from torch import Tensor, nn
 from torchrl.modules import MLP, ProbabilisticActor
 
+from deepracer_exp.compiled import njit
 from deepracer_exp.config.learning import PPOConfig
 
 from .actor_critic import ActorCritic

@@ -6,8 +6,9 @@ from statistics import NormalDist
 
 import numpy as np
 import pandas as pd
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
+
+from deepracer_exp.compiled import njit
 
 Values = NDArray[np.float64]
 MOST_ROWS = 100_000

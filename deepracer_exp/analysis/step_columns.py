@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numba import njit
 from numpy.typing import NDArray
 
 from deepracer_exp.aws.logs.recording import TRAINING
+from deepracer_exp.compiled import njit
 from deepracer_exp.env.rules import lap_clock_s
 from deepracer_exp.tracks.track import Track
 

@@ -8,8 +8,8 @@ road is an augmented Lagrangian (Howell, Jackson and Manchester, "ALTRO", IROS 2
 import math
 
 import numpy as np
-from numba import njit
 
+from deepracer_exp.compiled import njit
 from deepracer_exp.sim.rollout import advance, linearise
 from deepracer_exp.tracks.segments import along, is_on_road, nearest_segment
 

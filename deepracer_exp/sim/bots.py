@@ -2,7 +2,7 @@
 
 import math
 
-from numba import njit
+from deepracer_exp.compiled import njit
 
 from .placement import uniform
 

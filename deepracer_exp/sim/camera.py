@@ -4,8 +4,9 @@ Straight edges of the scenery are straight in the picture, which is summed up fr
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
+
+from deepracer_exp.compiled import njit
 
 from .camera_boxes import draw_boxes
 from .edges import add_edge

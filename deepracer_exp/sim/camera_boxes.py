@@ -4,7 +4,8 @@ The visible faces of one are added up as the scenery is (`edges`), with the shar
 """
 
 import numpy as np
-from numba import njit
+
+from deepracer_exp.compiled import njit
 
 from .edges import add_edge
 from .lens import NEAREST_M, view

@@ -3,7 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
+
+from deepracer_exp.compiled import njit
 
 CAR_M = (0.32352, 0.1961)
 """Crash rectangle of a car or bot, along and across, centred on its origin (deepracer-simapp,

@@ -7,7 +7,8 @@ pixel is the mean of what it sees (as glyph rasterisers do, R. Levien, "Inside t
 """
 
 import numpy as np
-from numba import njit
+
+from deepracer_exp.compiled import njit
 
 
 @njit(cache=True, fastmath=True, error_model="numpy", inline="always")

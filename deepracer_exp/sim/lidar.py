@@ -1,8 +1,9 @@
 """The LIDAR of all cars at once: distances to walls and boxes, whose sides are segments from above."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from deepracer_exp.compiled import njit
 
 from .scenery import box_corners
 

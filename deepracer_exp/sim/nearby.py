@@ -1,7 +1,8 @@
 """Which of the others are next to a car along the lap, and what a policy is shown of them."""
 
 import numpy as np
-from numba import njit
+
+from deepracer_exp.compiled import njit
 
 SHOWN = 4
 """Numbers that `next_ones` returns of each."""

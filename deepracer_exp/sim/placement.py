@@ -5,7 +5,8 @@ placed in one compiled pass (Steele and others, "Fast splittable pseudorandom nu
 """
 
 import numpy as np
-from numba import njit
+
+from deepracer_exp.compiled import njit
 
 END_M = 1.0
 """The last box or bot is placed at least so far before the start line (the service's)."""

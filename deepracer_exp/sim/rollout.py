@@ -5,9 +5,9 @@ forces. The steps are MuJoCo's: semi-implicit Euler.
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from deepracer_exp.compiled import njit
 from deepracer_exp.config.car import CarConfig
 
 from .tyres import DRIVE, car_record, push_cars

@@ -9,9 +9,9 @@ The forces are those of the end of the step (implicit Euler), so that stiff tyre
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from deepracer_exp.compiled import njit
 from deepracer_exp.config.car import CarConfig
 
 GRAVITY_MPS2 = 9.8

@@ -8,8 +8,9 @@ line is the fastest one that a local search finds; that no other line is faster 
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from deepracer_exp.compiled import njit
 
 from .track import Track
 

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
-from numba import njit
 from shapely.geometry.base import BaseGeometry
 
 from deepracer_exp.aws.worlds.routes import is_first_of_equals
+from deepracer_exp.compiled import njit
 
 CELL_M = 0.1
 """Side of a grid cell; doubled until the grid has at most `MOST_CELLS`."""

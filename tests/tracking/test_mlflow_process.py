@@ -8,6 +8,7 @@ import sys
 import psutil
 import pytest
 
+from deepracer_exp.tracking import mlflow_process
 from deepracer_exp.tracking.calls import StoreRefusedError, StoreUnavailableError
 from deepracer_exp.tracking.mlflow_process import RemoteRun, released
 from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
@@ -25,6 +26,11 @@ def process_of(run: RemoteRun) -> psutil.Process:
     ours = [child for child in psutil.Process().children() if "mlflow_process" in " ".join(child.cmdline())]
     assert len(ours) == 1
     return ours[0]
+
+
+@pytest.fixture(autouse=True)
+def _no_process_of_another_test():
+    mlflow_process._close_idle()
 
 
 @pytest.fixture

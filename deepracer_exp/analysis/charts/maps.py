@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from deepracer_exp.analysis.statistics import Values, means
+from deepracer_exp.compiled import njit
 from deepracer_exp.tracks.outline import Outline
 from deepracer_exp.tracks.track import Track
 
