@@ -53,7 +53,7 @@ def _content(file: str) -> bytes:
 def _of_package(locator: Any) -> Any:
     """Return a locator of compiled code for functions of this package."""
 
-    class Locator(locator):  # type: ignore[misc]
+    class Locator(locator):
         def __init__(self, function: FunctionType, file: str) -> None:
             super().__init__(function, file)
             self._stamp = source_stamp(function)
