@@ -147,7 +147,7 @@ def end_process(code: int) -> NoReturn:
     try:
         sys.stdout.flush()
         sys.stderr.flush()
-    except (OSError, ValueError):  # closed, or nobody reads it: Python has an answer to that
+    except (OSError, ValueError):  # closed, or its reader has ended: Python has an answer to that
         sys.exit(code)
     os._exit(code)
 

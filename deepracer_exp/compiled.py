@@ -20,7 +20,10 @@ from numba.core.caching import (
 )
 from numba.core.dispatcher import Dispatcher
 
-__all__ = ["njit"]
+__all__ = ["compiled", "njit"]
+
+# Divisions as NumPy's: a check for zero at each would keep loops from being optimized.
+compiled = njit(cache=True, nogil=True, error_model="numpy")
 
 _PACKAGE = Path(__file__).parent
 _COMPILED_IN = (bool, int, float, np.dtype)

@@ -1,7 +1,7 @@
 """Hydra composes the same choices once for all tests of a process: it was a quarter of their time.
 
 Options of a user's `./conf` count with their contents, since tests write such files. What concerns sweeps, whose
-studies may lie in the working folder, is composed anew each time.
+studies may lie in the working folder, is composed again each time.
 """
 
 import copy

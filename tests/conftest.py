@@ -41,7 +41,7 @@ settings.load_profile("same")
 
 compose_once()
 
-# Where containers forbid it, every process would compile the tests and the package anew: ten seconds of each worker.
+# Where containers forbid it, every process would compile the tests and the package again: ten seconds of each worker.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 

@@ -5,10 +5,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from deepracer_exp.compiled import compiled
 from deepracer_exp.config.driving import ObservationConfig, ObservationShape
 from deepracer_exp.config.own_class import OwnClass, build_own
 from deepracer_exp.errors import BadInput, reading
-from deepracer_exp.tracks.segments import compiled, pose_at
+from deepracer_exp.tracks.segments import pose_at
 from deepracer_exp.tracks.track import TrackIndex, Tracks
 
 from .state import Measures

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from deepracer_exp.compiled import compiled
 from deepracer_exp.config.driving import EpisodeConfig
 from deepracer_exp.rewards.params import TrackParams
 from deepracer_exp.sim.batch import CarState
-from deepracer_exp.tracks.segments import compiled, is_on_road, pose_at
+from deepracer_exp.tracks.segments import is_on_road, pose_at
 from deepracer_exp.tracks.track import Pose, Tracks
 
 from .setup import RaceSetup, courses_of_cars

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from deepracer_exp.tracks.segments import compiled
+from deepracer_exp.compiled import compiled
 
 from .rules import nearer_of
 from .trace import PACKED_COLUMNS, RANDOMIZED

@@ -150,8 +150,8 @@ def begin_study_run(
 ) -> tuple[StudyRun | None, str | None]:
     """Begin or continue the run of a study in MLflow; return it with its id.
 
-    The id is None if the store does not answer, or if nobody `waits` for it: the first trials' runs are then put under
-    the study's at the end.
+    The id is None if the store does not answer, or if it is not waited for (`waits`): the first trials' runs are then
+    put under the study's at the end.
     """
     if store is None:
         return None, None

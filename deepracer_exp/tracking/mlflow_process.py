@@ -144,7 +144,7 @@ def connect_here(store: Store) -> "MLflowRun":
 
 
 def released(run: "MLflowRun | RemoteRun | None", *, is_done: bool = True) -> None:
-    """Let go of a run; `is_done`: no call of it can still be under way."""
+    """Release a run; `is_done`: no call of it can still be under way."""
     if isinstance(run, RemoteRun):
         run.release() if is_done else run.discard()
 
@@ -203,7 +203,7 @@ def _close_idle() -> None:
 
 
 def _answer(questions: Connection, answers: Connection) -> None:
-    """Make the calls that are asked for until nobody asks any more."""
+    """Make the calls that are asked for until the pipe is closed."""
     run: MLflowRun | None = None
     while True:
         try:
@@ -230,7 +230,7 @@ def _answer(questions: Connection, answers: Connection) -> None:
 def _main() -> None:
     gc.disable()  # while MLflow is imported, of which nothing is garbage
     questions, answers = Connection(os.dup(0), writable=False), Connection(os.dup(1), readable=False)
-    # What MLflow prints is for nobody.
+    # What MLflow prints is not shown.
     with open(os.devnull, "r+b") as nothing:
         os.dup2(nothing.fileno(), 0)
         os.dup2(nothing.fileno(), 1)

@@ -115,7 +115,7 @@ class MLflowProjection:
             )
 
     def close(self, *, is_done: bool) -> None:
-        """Let go of the run; `is_done`: no update can still be under way."""
+        """Release the run; `is_done`: no update can still be under way."""
         released(self._run, is_done=is_done)
 
     def _opened(self) -> "MLflowRun | RemoteRun":

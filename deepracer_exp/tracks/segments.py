@@ -16,7 +16,7 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from deepracer_exp.aws.worlds.routes import is_first_of_equals
-from deepracer_exp.compiled import njit
+from deepracer_exp.compiled import compiled, njit
 
 CELL_M = 0.1
 """Side of a grid cell; doubled until the grid has at most `MOST_CELLS`."""
@@ -29,8 +29,6 @@ BAND_M = 0.1
 """Height of the y bands that edges are sorted into; grown until there are at most `MOST_BANDS`."""
 MOST_BANDS = 10_000
 
-# Divisions as NumPy's: a check for zero at each would keep loops from being optimized.
-compiled = njit(cache=True, nogil=True, error_model="numpy")
 # A query takes less time than passing all arrays to a function.
 inlined = njit(cache=True, nogil=True, error_model="numpy", inline="always")
 

@@ -44,6 +44,9 @@ def test_every_answer_is_that_of_the_course_alone(several, points):
         np.testing.assert_array_equal(ahead[own], track.points_at(ndist[own]))
         for part, alone_part in zip(start, track.start_pose(found.ndist[own]), strict=True):
             np.testing.assert_array_equal(part[own], alone_part)
+        pairs = np.column_stack([found.previous, found.next])[own]
+        waypoints, first = together.waypoints
+        np.testing.assert_array_equal(waypoints[first[place] + pairs], track.waypoints[pairs])
         assert together.length_m[place] == track.length_m
         assert together.closed[place] == track.closed
     assert road.any()
