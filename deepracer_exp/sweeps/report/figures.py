@@ -174,7 +174,7 @@ def _importance(importances: Mapping[str, float], keys: Mapping[str, str], title
     bars = {
         **{"type": "bar", "orientation": "h", "cliponaxis": False, "textposition": "outside"},
         **{"x": x, "y": [plain(keys[key], 40) for key in ranked]},
-        "text": [f"{value:.2f}" if value >= 0.01 else "<0.01" for value in x],
+        "text": [f"{value:.0%}" if value >= 0.01 else "<1%" for value in x],
         "hovertemplate": "%{y}: %{x:.0%}<extra></extra>",
     }
     axes: dict[str, Axis] = {
