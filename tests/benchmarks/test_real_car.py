@@ -30,9 +30,11 @@ def test_a_training_without_an_ingredient_differs_in_that_alone() -> None:
 
 def test_a_policy_drives_in_the_simulator_under_sim2real_and_as_the_car_in_parts() -> None:
     protocols = real_car.protocols()
-    assert list(protocols) == [SIMULATOR, "sim2real", "picture", "timing", "controls", CAR]
-    assert [config.usual for config in protocols.values()] == ["none", "sim2real", *["none"] * 4]
+    assert list(protocols) == [SIMULATOR, "sim2real", "picture", "timing", "controls", CAR, "car_sim2real"]
+    usual = {name: config.usual for name, config in protocols.items()}
+    assert usual == {name: "sim2real" if "sim2real" in name else "none" for name in protocols}
     assert protocols[SIMULATOR].real_car is protocols["sim2real"].real_car is None
+    assert protocols[CAR].real_car == protocols["car_sim2real"].real_car
     assert None not in vars(protocols[CAR].real_car).values()
     # None of its starts is one of the training's evaluations.
     trained = compose_experiment(["experiment=real_car"])[0].evaluation
@@ -59,7 +61,17 @@ def test_each_seed_is_trained_whole_and_without(
     monkeypatch.setattr(real_car, "trained", train)
     monkeypatch.setattr(real_car, "measure", measured)
     file = tmp_path / "real_car.json"
-    words = ["--seeds", "2", "--tracks", "Oval_track", "--without", "car", "network=shallow"]
+    words = [
+        "--seeds",
+        "2",
+        "--first-seed",
+        "0",
+        "--tracks",
+        "Oval_track",
+        "--without",
+        "car",
+        "network=shallow",
+    ]
     assert real_car.main([*words, "--runs-dir", str(tmp_path), "--json", str(file)]) == 0
     assert asked == [
         (f"Oval_track-{name}-{seed}", "network=shallow", f"seed={seed}")
