@@ -7,7 +7,7 @@ import numpy as np
 
 from deepracer_exp.compiled import compiled
 
-from .rules import nearer_of
+from .rule_passes import nearer_of
 from .trace import PACKED_COLUMNS, RANDOMIZED
 
 

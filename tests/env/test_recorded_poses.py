@@ -6,7 +6,8 @@ import pytest
 
 from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.env.rules import RaceRules, nearer_of
+from deepracer_exp.env.rule_passes import nearer_of
+from deepracer_exp.env.rules import RaceRules
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.env.trace import EPISODE_STATUS
 from deepracer_exp.rewards.reward import RewardFunction

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepracer_exp.aws.worlds.routes import read_route
-from deepracer_exp.env.rules import lap_progress
+from deepracer_exp.env.rule_passes import lap_progress
 from deepracer_exp.tracks.track import Track
 
 WHEELS_M = np.array([[0.082311, 0.0796], [0.082311, -0.0796], [-0.081663, 0.08105], [-0.081663, -0.08105]])
