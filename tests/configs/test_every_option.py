@@ -137,3 +137,5 @@ def test_every_reward_of_the_zoo_has_an_option_of_its_name():
     # Other options are functions of the zoo with other constants.
     assert {option: name for option, name in names.items() if option in zoo} == {name: name for name in zoo}
     assert set(names.values()) == zoo
+    for option in names.keys() - zoo:
+        assert composed("reward", option)[0].reward.constants
