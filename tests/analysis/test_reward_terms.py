@@ -16,7 +16,7 @@ from .made_up import Drive, made_up_recording
 
 CAR = compose_experiment([])[0].car
 WITH_TERMS = (
-    *("center_speed_blend", "progress_delta", "racing_line"),
+    *("center_speed_blend", "progress_delta", "careful_progress", "racing_line"),
     *("avoid_objects", "free_lane", "overtake", "self_motivator", "steps_to_finish"),
 )
 
