@@ -1,7 +1,7 @@
 """Teaches laps that are reliable on unknown tyres and light: as progress_delta, but leaving the road costs more.
 
-It costs five metres instead of two, so that a policy that becomes faster does not fail more often. For policies of a
-real car (experiment=real_car). Fails where each tenth of a second counts, and as progress_delta does.
+It costs five metres instead of two, so that a policy that becomes faster fails less often. For policies of a real car
+(experiment=real_car). Fails where each tenth of a second counts, and as progress_delta does.
 """
 
 import numpy as np
