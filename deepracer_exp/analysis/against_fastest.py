@@ -1,5 +1,6 @@
 """A lap of a run of ours against the fastest lap of its car: the seconds lost in each sector, and by what."""
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pandas as pd
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.fastest.lap import FastestLap, Question, kept_lap
+from deepracer_exp.lookup.next_steps import COMMAND, own_word
 from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.tracks.track import Track
 
@@ -141,7 +143,7 @@ def loss_in_words(view: LogView, folder: Path) -> str:
     except BadInput as error:
         return f"none: {error}"
     if question is None or kept_lap(question) is None:
-        return f"not searched yet: deepracer-exp analyze {folder.name} --fastest"
+        return f"not searched yet: {COMMAND} analyze {shlex.quote(own_word(folder))} --fastest"
     lost = loss(view, folder)
     return f"no complete {view.lap_word} from the start line" if lost is None else lost_in_words(lost)
 

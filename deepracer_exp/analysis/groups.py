@@ -11,7 +11,7 @@ import numpy as np
 
 from deepracer_exp.analysis.comparison import value_text
 from deepracer_exp.files import read_yaml
-from deepracer_exp.runs.files import OVERRIDES, RunRecord
+from deepracer_exp.runs.files import OVERRIDES, WRITTEN, RunRecord
 from deepracer_exp.runs.lineage import course_names, run_differences
 from deepracer_exp.runs.result import FIGURES, result_of
 
@@ -130,7 +130,7 @@ def _labels(records: Sequence[RunRecord]) -> list[str]:
 def _overrides(run: Path) -> dict[str, str]:
     """Return the overrides of a run by key, without those that say nothing of its group."""
     file = run / OVERRIDES
-    words = read_yaml(file, "what a run writes there") if file.is_file() else []
+    words = read_yaml(file, WRITTEN) if file.is_file() else []
     pairs = [str(word).partition("=") for word in words or ()]
     return {
         key.lstrip("+~"): value

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deepracer_exp.errors import BadInput, nearest, reading
-from deepracer_exp.runs.files import BEST, RUN, run_folders
+from deepracer_exp.runs.files import BEST, RUN, run_folders, shortest_names
 
 if TYPE_CHECKING:
     from deepracer_exp.lookup.resolve import StoredRun
@@ -168,7 +168,7 @@ def complete_runs(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> lis
     words = [word for word in _words(parsed_args) if is_override(word)]
     folders = run_folders(split_stores(words)[0].runs_dir)
     best = sorted({f"{BEST}{folder.parent.name}" for folder in folders})
-    return [folder.name for folder in folders] + best + complete_overrides(prefix, parsed_args)
+    return shortest_names(folders) + best + complete_overrides(prefix, parsed_args)
 
 
 def complete_overrides(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[str]:

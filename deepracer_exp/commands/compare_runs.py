@@ -195,17 +195,13 @@ def _generations(records: "Sequence[RunRecord]") -> "Chart | None":
     """Draw a run and the clones of it on one axis of iterations; None where there are none, or without their traces."""
     from deepracer_exp.analysis.charts.runs import generations
     from deepracer_exp.analysis.log_view import prepare
-    from deepracer_exp.runs.lineage import read_lineage
+    from deepracer_exp.runs.lineage import clone_chain
     from deepracer_exp.runs.recording import read_log
 
-    parents = {record.name: lineage.parent for record in records if (lineage := read_lineage(record.path))}
-    names = {record.name for record in records}
-    family = {name for child, parent in parents.items() if parent in names for name in (child, parent)}
-    if not family:
+    chain = clone_chain([record.path for record in records])
+    if not chain:
         return None
     try:
-        return generations(
-            [light(prepare(read_log(record.path))) for record in records if record.name in family]
-        )
+        return generations([light(prepare(read_log(folder))) for folder in chain])
     except BadInput:  # a trace was removed
         return None

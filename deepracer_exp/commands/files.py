@@ -119,13 +119,14 @@ def _holds_model(path: str) -> bool:
 def _import_model(args: argparse.Namespace) -> int:
     import zipfile
 
+    from deepracer_exp.lookup.next_steps import own_word
     from deepracer_exp.training.import_model import import_model
 
     imported = import_model(args.path, args.name, args.overrides)
     print_notes(imported.notes)
     for path in (*imported.options, imported.folder):
         print(path)
-    run = shlex.quote(imported.folder.name)
+    run = shlex.quote(own_word(imported.folder))
     print(f"\n  race it            deepracer-exp evaluate {run}")
     print(f"  train it further   deepracer-exp clone {run}")
     if imported.has_logs and not zipfile.is_zipfile(args.path):

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deepracer_exp.errors import BadInput, count
-from deepracer_exp.runs.files import BEST_LAP, CHECKPOINTS, LEARNING, METRICS, REPORT, read_metrics
+from deepracer_exp.runs.files import BEST_LAP, CHECKPOINTS, LEARNING, METRICS, REPORT, full_name, read_metrics
 from deepracer_exp.runs.result import FAILED, RELIABLE, fastest_reliable
 
 if TYPE_CHECKING:
@@ -128,7 +128,7 @@ def print_result(outcome: "TrainResult", tracking: "TrackingConfig") -> None:
     if outcome.note is not None:
         print(f"warning: {outcome.note}", file=sys.stderr)
     if isinstance(tracking, MLflowTracking) and outcome.unrecorded is None:
-        print(f"  compare runs  {_command()} ui{_store_word(outcome.folder.parent.parent, tracking.uri)}")
+        print(f"  compare runs  {_command()} ui{store_word(outcome.folder.parent.parent, tracking.uri)}")
     steps = next_steps(outcome.folder, summary)
     print_steps([(line.replace(COMMAND, _command(), 1), what) for line, what in steps])
     _print_unrecorded([outcome], tracking)
@@ -162,7 +162,7 @@ def print_results(outcomes: "Sequence[TrainResult]", tracking: "TrackingConfig")
     """Print one line per run, and what groups of runs that differ only in their seed and track scored."""
     print(f"\n{count(len(outcomes), 'run')}:")
     for outcome in outcomes:
-        print(f"  {outcome.folder.name}  {outcome.status}  {_lap(outcome)}  {outcome.reason}")
+        print(f"  {full_name(outcome.folder)}  {outcome.status}  {_lap(outcome)}  {outcome.reason}")
     _print_groups([outcome.folder for outcome in outcomes if outcome.status != FAILED])
     _print_unrecorded(outcomes, tracking)
 
@@ -198,7 +198,7 @@ def _print_unrecorded(outcomes: "Sequence[TrainResult]", tracking: "TrackingConf
         print(f"\nwarning: {reason}", file=sys.stderr)
     if lacking and isinstance(tracking, MLflowTracking):
         words = shlex.join(own_word(outcome.folder) for outcome in lacking)
-        store = _store_word(lacking[0].folder.parent.parent, tracking.uri)
+        store = store_word(lacking[0].folder.parent.parent, tracking.uri)
         print(
             f"  the run folder has everything; send it later: {_command()} runs send {words}{store}",
             file=sys.stderr,
@@ -226,7 +226,7 @@ def print_unsent(study: "Path") -> None:
         )
 
 
-def _store_word(runs_dir: "Path", uri: str | None) -> str:
+def store_word(runs_dir: "Path", uri: str | None) -> str:
     """Return the word of a command line that says where runs are recorded; empty for the usual place."""
     store = f"runs_dir={runs_dir}" if uri is None else f"tracking.uri={uri}"
     return "" if store == "runs_dir=runs" else f" {shlex.quote(store)}"

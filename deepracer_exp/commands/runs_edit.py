@@ -1,6 +1,7 @@
 """`deepracer-exp runs send`, `rename`, `note`, `tag` and `delete`: what is done to single runs."""
 
 import argparse
+import shlex
 import sys
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
@@ -8,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deepracer_exp.errors import BadInput, count
-from deepracer_exp.runs.files import TRACKING, run_folders
+from deepracer_exp.runs.files import TRACKING, full_name, run_folders
 
 from .arguments import (
     STORES,
@@ -20,6 +21,7 @@ from .arguments import (
     read_stores,
     runs_and_overrides,
 )
+from .output import store_word
 
 if TYPE_CHECKING:
     from deepracer_exp.runs.labels import Labels
@@ -88,7 +90,7 @@ def _send(args: argparse.Namespace) -> int:
     code = 0
     for folder in dict.fromkeys(folders):
         if is_delivered(folder, stores.uri, stores.runs_dir):
-            print(f"{folder.name}: MLflow has everything")
+            print(f"{full_name(folder)}: MLflow has everything")
             continue
         try:
             points = deliver(folder, stores.uri, stores.runs_dir)
@@ -96,7 +98,7 @@ def _send(args: argparse.Namespace) -> int:
             print(f"deepracer-exp: {error}", file=sys.stderr)
             code = 2
             continue
-        print(f"{folder.name}: sent, with {count(points, 'metric point')} that MLflow lacked")
+        print(f"{full_name(folder)}: sent, with {count(points, 'metric point')} that MLflow lacked")
     if not folders:
         print(f"MLflow ({store.shown}) has everything of the ended runs in {stores.runs_dir}")
     return code
@@ -106,7 +108,6 @@ def _send(args: argparse.Namespace) -> int:
 class _Target:
     """A run that is labelled: its folder, its run in MLflow, or both."""
 
-    name: str
     folder: Path | None
     run_id: str | None
     stores: Stores
@@ -123,6 +124,7 @@ class _Target:
 
     def write(self, labels: "Labels") -> None:
         """Write labels into the folder and into MLflow; if that lacks them, say so."""
+        from deepracer_exp.lookup.next_steps import own_word
         from deepracer_exp.runs.labels import write_labels
         from deepracer_exp.tracking.delivery import deliver_labels
         from deepracer_exp.tracking.store import has_store, resolve_store
@@ -142,7 +144,8 @@ class _Target:
                 raise
             recorded = read_tracked_run(self.folder / TRACKING)
             TrackingFile(self.folder, recorded, store.shown).change(complete=False)
-            print(f"warning: {error}\n  send it later: deepracer-exp runs send {self.name}", file=sys.stderr)
+            word = shlex.quote(own_word(self.folder)) + store_word(self.stores.runs_dir, self.stores.uri)
+            print(f"warning: {error}\n  send it later: deepracer-exp runs send {word}", file=sys.stderr)
 
 
 def _target(name: str, stores: Stores) -> _Target:
@@ -154,8 +157,8 @@ def _target(name: str, stores: Stores) -> _Target:
     except BadInput:
         if not is_run_id(name):
             raise
-        return _Target(name, None, name, stores)  # its folder is on another machine
-    return _Target(name, folder, read_run_id(folder), stores)
+        return _Target(None, name, stores)  # its folder is on another machine
+    return _Target(folder, read_run_id(folder), stores)
 
 
 def _rename(args: argparse.Namespace) -> int:

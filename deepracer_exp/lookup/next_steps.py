@@ -13,9 +13,9 @@ from deepracer_exp.runs.files import (
     BEST,
     METRICS,
     RunRecord,
+    full_name,
     read_config,
     read_metrics,
-    run_folders,
     sees_pictures,
 )
 from deepracer_exp.runs.folder import is_held
@@ -170,16 +170,12 @@ def run_word(run: Path) -> str:
 
 
 def own_word(run: Path) -> str:
-    """Return what a run will be called on the command line whatever is trained later.
+    """Return what a run will be called on the command line whatever is trained later: its folder.
 
-    That is its name, shortened to the time it began if no other began then, or its folder, where commands do not look
-    for it by themselves.
+    The folder's name may be that of another run, too, which begins in the same second, or in the hour that summer time
+    repeats.
     """
-    if not _is_in_runs(run):
-        return str(run)
-    began = "-".join(run.name.split("-")[:2])
-    others = [folder for folder in run_folders(_RUNS) if folder.name.startswith(began)]
-    return began if len(others) == 1 else run.name
+    return str(_RUNS / full_name(run)) if _is_in_runs(run) else str(run)
 
 
 def _is_in_runs(run: Path) -> bool:

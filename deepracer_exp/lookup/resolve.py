@@ -18,7 +18,17 @@ from deepracer_exp.runs.checkpoint_files import (
     restore_links,
     verify,
 )
-from deepracer_exp.runs.files import BEST, CHECKPOINTS, CONFIG, RUN, is_run, read_config, run_folders
+from deepracer_exp.runs.files import (
+    BEST,
+    CHECKPOINTS,
+    CONFIG,
+    RUN,
+    is_run,
+    read_config,
+    read_run_id,
+    run_folders,
+    shortest_names,
+)
 from deepracer_exp.runs.labels import named_folders
 from deepracer_exp.tracking.registry import Registered, download_folder, fetch, is_alias, look_up
 from deepracer_exp.tracking.store import has_store, is_run_id, open_client
@@ -139,7 +149,7 @@ def resolve(run: str, runs_dir: Path, tracking_uri: str | None) -> StoredRun:
     if matches:
         names = ", ".join(str(folder.relative_to(runs_dir)) for folder in matches[:3])
         raise BadInput(run, f"ambiguous: {len(matches)} runs match: {names}{', ...' * (len(matches) > 3)}")
-    unknown = f"no such run in {runs_dir} ({len(folders)} there){nearest(run, [f.name for f in folders])}"
+    unknown = f"no such run in {runs_dir} ({len(folders)} there){nearest(run, shortest_names(folders))}"
     if any(folder.parent.name == run for folder in folders):
         unknown += f"; {BEST}{run} is the best run of that experiment"
     if not is_alias(run) or not has_store(tracking_uri, runs_dir):
@@ -179,6 +189,7 @@ def _recorded(run: str, runs_dir: Path, tracking_uri: str | None) -> Path:
         raise BadInput(run, "has no tag run_dir, so it is not a run of deepracer-exp")
     folder = Path(recorded.data.tags["run_dir"])
     for place in (folder, runs_dir / folder.parent.name / folder.name):
-        if is_run(place):
+        # Another machine may have made a run of the same path.
+        if is_run(place) and read_run_id(place) in (None, run):
             return place
-    raise BadInput(run, f"its folder {folder} is gone; give the folder where it is now")
+    raise BadInput(run, f"its folder {folder} is gone, or another run's; give the folder where it is now")

@@ -1,6 +1,7 @@
 """The pictures and the page of a training."""
 
 import logging
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.race import RaceConfig
 from deepracer_exp.env.placement import box_corners_of, read_placements
 from deepracer_exp.env.setup import Course
+from deepracer_exp.lookup.next_steps import COMMAND, own_word
 from deepracer_exp.runs.files import BEST_LAP, LEARNING, METRICS, REPORT, TRACE, read_config, sees_pictures
 from deepracer_exp.runs.trace import has_trace, missing_trace, read_others, read_trace
 from deepracer_exp.tracks.track import Track
@@ -75,7 +77,7 @@ def write_run_page(run_dir: Path, car: CarConfig) -> str | None:
             view, strip = run_glimpses(view, run_dir, just_trained=True)
         write_log_page(run_dir / REPORT, LogPage(view, findings(view), terms=terms, strip=strip))
     except KeyboardInterrupt:
-        return f"{REPORT} was left off; `deepracer-exp analyze {run_dir.name}` writes it"
+        return f"{REPORT} was left off; `{COMMAND} analyze {shlex.quote(own_word(run_dir))}` writes it"
     except Exception as error:
         note = f"{REPORT} could not be written: {' '.join(f'{type(error).__name__}: {error}'.split())}"
         # Commands print the line; warnings would be shown twice.

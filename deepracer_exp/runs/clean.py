@@ -20,6 +20,7 @@ from .files import (
     REPLAY,
     SUMMARY,
     TRACE,
+    full_name,
     read_object,
     read_run_id,
 )
@@ -51,7 +52,7 @@ class StoreOverview:
     deleted: dict[str, bool]
     """Whether each run, by id, was deleted there."""
     registered: set[tuple[str, str]]
-    """Checkpoints that are versions of a model: names of the run's and the checkpoint's folder."""
+    """Checkpoints that are versions of a model: the full name of the run, and the name of the checkpoint's folder."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ def survey(runs_dir: Path, overview: StoreOverview | None) -> Removables:
         for folder, name in () if overview is None else sorted(overview.registered):
             wanted[folder].setdefault(name, "registered")
         for run in _own_runs(runs_dir):
-            _search(run, wanted[run.name], overview, removables)
+            _search(run, wanted[full_name(run)], overview, removables)
     except OSError as error:
         raise BadInput(error.filename, f"cannot be read: {error.strerror}; nothing is removed") from error
     return removables
@@ -204,7 +205,7 @@ def deletable(run: Path, runs_dir: Path) -> Removable:
     place = run.resolve()
     if run.is_symlink() or place.parent.parent != runs_dir.resolve() or place.parent.is_symlink():
         raise BadInput(run, f"is not a run's own folder in runs_dir={runs_dir}; nothing was deleted")
-    wanted = _cloned_from(runs_dir)[place.name] | {
+    wanted = _cloned_from(runs_dir)[full_name(place)] | {
         name: ", ".join(reasons) for name, reasons in pinned(run / CHECKPOINTS).items()
     }
     reasons = [f"checkpoint {name} is {why}" for name, why in sorted(wanted.items())]
@@ -222,12 +223,13 @@ def _own_runs(runs_dir: Path) -> Iterator[Path]:
 
 
 def _cloned_from(runs_dir: Path) -> dict[str, dict[str, str]]:
-    """Return the checkpoints that clones started from, by name of the run's folder."""
+    """Return the checkpoints that clones started from, by the full name of the run."""
     names: dict[str, dict[str, str]] = defaultdict(dict)
     for file in runs_dir.glob(f"*/*/{LINEAGE}"):
         lineage = read_lineage(file.parent)
         if lineage is not None:
-            names[lineage.parent][lineage.checkpoint] = f"cloned to {file.parent.name}"
+            parent = full_name(Path(lineage.parent_dir))
+            names[parent][lineage.checkpoint] = f"cloned to {full_name(file.parent)}"
     return names
 
 

@@ -5,7 +5,8 @@ import getpass
 import json
 import os
 import socket
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,8 @@ MLFLOW_DB = "mlflow.db"
 """Database in `runs_dir`."""
 BEST = "best:"
 """Prefix of an experiment's name that means its best run."""
+WRITTEN = "what a run writes there"
+"""What is accepted as a file of a run's folder, for messages."""
 RUN = "a run's folder, its name or the beginning of it, MLflow's id, best:EXPERIMENT, MODEL@ALIAS or ALIAS"
 """The forms in which commands accept a run."""
 
@@ -59,6 +62,21 @@ def is_run(folder: Path) -> bool:
 def run_folders(runs_dir: Path) -> list[Path]:
     """Return the folders of the runs of all experiments; a hidden one is being downloaded, or was cut off."""
     return sorted(file.parent for file in runs_dir.glob(f"*/[!.]*/{CONFIG}"))
+
+
+def full_name(folder: Path) -> str:
+    """Return EXPERIMENT/FOLDER, which names one run of `runs_dir`.
+
+    The folder's name alone does not: runs of two experiments may begin in one second.
+    """
+    folder = folder.absolute()
+    return f"{folder.parent.name}/{folder.name}"
+
+
+def shortest_names(folders: Sequence[Path]) -> list[str]:
+    """Return the shortest name of each run folder that is not another's as well."""
+    number = Counter(folder.name for folder in folders)
+    return [folder.name if number[folder.name] == 1 else full_name(folder) for folder in folders]
 
 
 @dataclass(frozen=True)
@@ -103,7 +121,7 @@ def read_config(path: Path) -> dict[str, Any]:
         BadInput: it cannot be read or holds no values.
     """
     file = path / CONFIG
-    mapping = read_yaml(file, "what a run writes there")
+    mapping = read_yaml(file, WRITTEN)
     if not isinstance(mapping, dict):
         raise BadInput(file, "holds no values; a run writes its experiment there")
     return {str(key): value for key, value in mapping.items()}
@@ -154,7 +172,7 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
 
 
 def _text(path: Path) -> str:
-    return read_text(path, "what a run writes there", RECORD_BYTES)
+    return read_text(path, WRITTEN, RECORD_BYTES)
 
 
 def _object(path: Path, text: str, where: str = "") -> dict[str, Any]:

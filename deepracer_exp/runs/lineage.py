@@ -1,6 +1,7 @@
 """Lineage: what a run was cloned from, and the family tree of its ancestors and clones."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -14,7 +15,7 @@ from deepracer_exp.env.action_space import build_action_space, describe_actions
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import read_json_as
 
-from .files import LINEAGE, REWARD, RunRecord, is_run, read_head
+from .files import LINEAGE, REWARD, RunRecord, full_name, is_run, read_head
 from .result import RunResult, read_result
 
 _NO_EFFECT = ("runs_dir", "debug", "report", "tracking")
@@ -103,6 +104,7 @@ class FamilyMember:
     """A run of the family."""
 
     name: str
+    """EXPERIMENT/FOLDER."""
     path: Path
     record: RunRecord | None
     """The run's files; None if its folder is gone."""
@@ -157,6 +159,22 @@ def family(run: Path, runs_dir: Path) -> FamilyMember:
             raise BadInput(root / LINEAGE, f"{root.name} descends from itself; nothing can be shown")
         root = parent
     return _grow(root, children, lineages)
+
+
+def clone_chain(runs: Sequence[Path]) -> list[Path]:
+    """Return those of the runs that are a run and its clones, the oldest first; an unreadable lineage counts as none.
+
+    The result is of resolved folders.
+    """
+    generations, parents = dict[Path, int](), dict[Path, Path]()
+    for run in map(Path.resolve, runs):
+        generations[run] = 0
+        with suppress(BadInput):
+            if (lineage := read_lineage(run)) is not None:
+                generations[run] = lineage.generation
+                parents[run] = _parent(lineage, [run.parent.parent])
+    related = {run for pair in parents.items() if pair[1] in generations for run in pair}
+    return sorted(related, key=lambda run: (generations[run], run))
 
 
 def best_members(root: FamilyMember) -> dict[int, str]:
@@ -224,7 +242,7 @@ def _grow(
             differences = run_differences([record, child.record])
             child.changes = {key: (a, b) for key, (a, b) in differences.items() if key not in _IGNORED}
     result = None if record is None else read_result(root)
-    return FamilyMember(root.name, root, record, lineage, generation, result, below)
+    return FamilyMember(full_name(root), root, record, lineage, generation, result, below)
 
 
 def run_differences(records: Sequence[RunRecord]) -> dict[str, list[Any]]:

@@ -6,7 +6,7 @@ from typing import Any
 
 from deepracer_exp.errors import BadInput
 
-from .files import CONFIG, PROVENANCE, SUMMARY, read_object, read_run_id, run_folders
+from .files import CONFIG, PROVENANCE, SUMMARY, full_name, read_object, read_run_id, run_folders
 from .labels import read_labels
 
 COLUMNS = (
@@ -38,7 +38,7 @@ def rows_of_folder(runs_dir: Path) -> list[Row]:
 
 def _of_folder(folder: Path) -> Row:
     row: Row = dict.fromkeys(COLUMNS)
-    row |= {"run": f"{folder.parent.name}/{folder.name}", "began": iso_time(_began_s(folder))}
+    row |= {"run": full_name(folder), "began": iso_time(_began_s(folder))}
     try:
         summary, labels = read_object(folder / SUMMARY), read_labels(folder)
         row["id"] = read_run_id(folder)

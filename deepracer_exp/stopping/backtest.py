@@ -10,7 +10,7 @@ from deepracer_exp.config.driving import ActionSpaceConfig
 from deepracer_exp.config.stopping import ReliableStopping, StoppingConfig
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.errors import BadInput
-from deepracer_exp.runs.files import CONFIG, METRICS, RunRecord
+from deepracer_exp.runs.files import CONFIG, METRICS, RunRecord, full_name
 from deepracer_exp.runs.fingerprint import REMEMBERED_EPISODES
 from deepracer_exp.runs.result import with_unit
 
@@ -78,7 +78,7 @@ def backtest(record: RunRecord, config: StoppingConfig, rule: str) -> Backtest:
             break
     last, end = rows[-1], rows[count - 1]
     return Backtest(
-        run=record.name,
+        run=full_name(record.path),
         rule=rule,
         decision=decision,
         iteration=end["iteration"],
@@ -143,8 +143,8 @@ def _check_episodes(record: RunRecord, config: ReliableStopping) -> None:
     remembered = record.config.get("stopping", {}).get("episodes", REMEMBERED_EPISODES)
     if remembered != config.episodes:
         raise BadInput(
-            f"stopping.episodes={config.episodes}: {record.name} recorded the share of its last {remembered} episodes; "
-            f"accepted: {remembered}"
+            f"stopping.episodes={config.episodes}: {full_name(record.path)} recorded the share of its last "
+            f"{remembered} episodes; accepted: {remembered}"
         )
 
 

@@ -15,7 +15,15 @@ from deepracer_exp.config.experiment import safe_name
 from deepracer_exp.errors import BadInput, nearest
 from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, find_checkpoint, pin, verify
 from deepracer_exp.runs.clean import StoreOverview
-from deepracer_exp.runs.files import BEST_LAP, CHECKPOINTS, METRICS, REPORT, read_metrics, read_run_id
+from deepracer_exp.runs.files import (
+    BEST_LAP,
+    CHECKPOINTS,
+    METRICS,
+    REPORT,
+    full_name,
+    read_metrics,
+    read_run_id,
+)
 
 from .calls import pages
 from .download import Download, download
@@ -152,7 +160,7 @@ def promote(
             "is not recorded in MLflow (another tracking=, or the store was down), so it cannot be registered",
         )
     tags = {_RUN_DIR: str(run.resolve()), _CHECKPOINT: folder.name, _SHA256: checkpoint_sha256(folder)}
-    what = f"promote {run.name}"
+    what = f"promote {full_name(run)}"
     with open_client(what, uri, runs_dir) as client:
         recorded = client.get_run(run_id).info
         if recorded.lifecycle_stage != "active":
@@ -169,9 +177,7 @@ def promote(
             logged = _log_model(
                 client, recorded.experiment_id, run_id, run, folder, tags, features, seen, metrics
             )
-            shown = (
-                f"Checkpoint {int(folder.name)} of `{run.name}`: {race_result(metrics)}.\n\n{picture(run_id)}"
-            )
+            shown = f"Checkpoint {int(folder.name)} of `{full_name(run)}`: {race_result(metrics)}.\n\n{picture(run_id)}"
             version = _version_of(client, logged.model_id, model, run_id, tags, shown)
         client.set_registered_model_alias(model, alias, version.version)
         return _registered(what, version, alias)
@@ -270,7 +276,7 @@ def read_overview(uri: str | None, runs_dir: Path) -> StoreOverview:
         )
         deleted = {run.info.run_id: run.info.lifecycle_stage != "active" for run in runs}
         registered = {
-            (Path(version.tags[_RUN_DIR]).name, version.tags[_CHECKPOINT])
+            (full_name(Path(version.tags[_RUN_DIR])), version.tags[_CHECKPOINT])
             for version in pages(client.search_model_versions)
             if version.tags.keys() >= {_RUN_DIR, _CHECKPOINT}
         }
@@ -308,11 +314,16 @@ def fetch(registered: Registered, uri: str | None, runs_dir: Path) -> Path:
     The folder is where it would be if the run had been trained in `runs_dir`.
 
     Raises:
-        BadInput: a name cannot be one of a run, or `download` fails.
+        BadInput: a name cannot be one of a run, another run has that folder, or `download` fails.
     """
     store = existing_store(uri, runs_dir)
     client_of(store)  # leaves user and password in the environment, which the download inherits
     target = download_folder(registered.run_dir, runs_dir)
+    if read_run_id(target) not in (None, registered.run_id):
+        raise BadInput(
+            registered,
+            f"{target} is another run, so its checkpoint cannot be downloaded to it; give runs_dir=",
+        )
     wanted = Download(
         uri=store.uri,
         model_id=registered.model_id,

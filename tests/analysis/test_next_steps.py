@@ -21,12 +21,13 @@ def runs(copied, monkeypatch):
     return first, later
 
 
-def test_the_best_run_has_a_short_name_and_so_has_another(runs):
+def test_a_word_names_one_run_though_another_experiment_has_a_run_of_the_same_second(runs):
     first, later = runs
+    other = first.parents[1] / "other" / first.name
+    shutil.copytree(first, other, symlinks=True)
     assert run_word(later) == f"best:{later.parent.name}"
-    assert own_word(later) == "20990101-000000"
-    assert run_word(first) == own_word(first) == first.name[:15]
-    for run in runs:
+    assert run_word(first) == own_word(first) == f"runs/{first.parent.name}/{first.name}"
+    for run in (*runs, other):
         for word in (run_word(run), own_word(run)):
             assert resolve(word, first.parents[1], None).path.samefile(run)
 

@@ -19,6 +19,7 @@ from deepracer_exp.runs.clean import (
     replays,
     survey,
 )
+from deepracer_exp.runs.files import full_name
 from deepracer_exp.tracking.registry import read_overview
 
 HOUR_S = 3600
@@ -55,6 +56,17 @@ def test_a_clones_parent_is_known_by_name_where_its_folder_was_moved(season, tmp
     assert listed(season) == [("2", SPARE_CHECKPOINTS, ["000010"])]
     pin(season.runs_dir / "season" / "2" / "checkpoints", "000010", "cloned into season")
     assert listed(season) == []
+
+
+def test_what_is_needed_of_a_run_is_not_kept_of_another_experiments_run_of_the_same_name(season, client):
+    season.champion(client)
+    season.clone("2", season.run("9"), checkpoint="000010")
+    for name in ("1", "9"):
+        season.run(name, "other")
+    removable = surveyed(season, asked=True).removable
+    spare = {full_name(item.run): [path.name for path in item.paths] for item in removable}
+    assert spare["other/1"] == spare["other/9"] == ["000010"]
+    assert "season/9" not in spare
 
 
 def test_a_registered_checkpoint_stays_though_nothing_else_says_so(season, client):
@@ -113,7 +125,7 @@ def test_a_deleted_run_that_is_needed_is_kept_with_a_reason(season, client):
         client.delete_run(run_id)
     assert DELETED not in [what for _, what, _ in listed(season, asked=True)]
     reasons = kept(season, asked=True)
-    assert reasons["1"] == "deleted in MLflow, but needed: 000020 cloned to 3"
+    assert reasons["1"] == "deleted in MLflow, but needed: 000020 cloned to season/3"
     assert reasons["2"] == "deleted in MLflow, but needed: 000020 registered as season"
 
 

@@ -86,6 +86,14 @@ def test_a_checkpoint_that_is_gone_from_its_run_is_downloaded_alone(season, clie
     assert (run / "config.yaml").read_text() == "own: true\n"
 
 
+def test_a_checkpoint_is_not_downloaded_into_another_run_of_the_same_name(season, away):
+    other = season.run("1")
+    shutil.rmtree(other / "checkpoints" / "000020")
+    (other / "tracking.json").write_text(json.dumps({"run_id": "0" * 32}))
+    assert f"{other} is another run" in refused(resolve, "champion", season.runs_dir, None)
+    assert not (other / "checkpoints" / "000020").exists()
+
+
 @pytest.mark.usefixtures("downloads_here")
 @pytest.mark.parametrize(
     ("harm", "words"),

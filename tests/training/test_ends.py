@@ -3,6 +3,7 @@
 import os
 import re
 import shlex
+import shutil
 import signal
 import threading
 
@@ -39,7 +40,7 @@ def test_a_run_that_does_not_learn_is_stopped_early(trained):
     assert 0.99 < stopping["values"]["entropy"] <= 1
 
 
-def test_the_replay_of_a_run_comes_to_the_runs_own_decision(trained, call):
+def test_the_replay_of_a_run_comes_to_the_runs_own_decision(trained, copied, call):
     ended = trained(*NOT_LEARNING)
     found = backtest(read_record(ended.folder), compose_experiment(NOT_LEARNING)[0].stopping, "")
     assert found.iteration == ended.summary["iteration"]
@@ -98,7 +99,7 @@ def test_wherever_a_run_ends_its_last_policy_is_evaluated_and_all_name_the_same_
         ended = train_here(*own, "budget.env_steps=100000000")
         assert ended.code == 130
         assert "stopping: this iteration is finished" in ended.stderr
-        assert re.search(rf" resume {ended.folder.name[:15]}\s", ended.stdout)
+        assert re.search(rf" resume \S+/{ended.folder.name}\s", ended.stdout)
     last, best = ended.metrics[-1], ended.summary["best"]
     assert last["iteration"] % 50 != 0
     assert best["iteration"] == last["iteration"]
@@ -117,7 +118,9 @@ def test_wherever_a_run_ends_its_last_policy_is_evaluated_and_all_name_the_same_
 
 def test_the_lines_to_paste_after_a_training_work(trained, copied, call):
     limits = ("budget.iterations=1", "budget.env_steps=1")  # reached by the same iteration
-    copied(*limits)
+    run = copied(*limits)
+    # One of another experiment that began in the same second.
+    shutil.copytree(run, run.parents[1] / "other" / run.name, symlinks=True)
     ended = trained(*limits)
     begin = ended.stdout.index("\n  next\n")
     shown = [shlex.split(line, comments=True) for line in ended.stdout[begin:].splitlines()[2:]]

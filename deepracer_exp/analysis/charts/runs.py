@@ -1,6 +1,5 @@
 """Several runs or checkpoints in one figure: learning curves, generations, generalisation, speed and stability."""
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,9 +12,9 @@ from deepracer_exp.analysis.evidence import iqm_band
 from deepracer_exp.analysis.log_view import LogView
 from deepracer_exp.analysis.statistics import Values, moving_average
 from deepracer_exp.aws.logs.recording import TRAINING
-from deepracer_exp.errors import BadInput
+from deepracer_exp.files import read_json
 from deepracer_exp.runs.files import EVALUATIONS, METRICS
-from deepracer_exp.runs.lineage import read_lineage
+from deepracer_exp.runs.lineage import clone_chain
 
 from .figure import Chart, Layer, Panel, band, heatmap, in_rows, line, mark, note, points
 from .style import BLUE, CATEGORIES, FAINT, INK, ORANGE
@@ -161,17 +160,8 @@ def generations(views: Sequence[LogView]) -> Chart | None:
 
 def _clone_chain(views: Sequence[LogView]) -> list[LogView]:
     """Return the views that are a run and its clones, the oldest first; none where that is not known."""
-    parents, number = {}, {}
-    for view in views:
-        folder = run_folder(view)
-        try:
-            lineage = read_lineage(folder) if folder is not None else None
-        except BadInput:  # an unreadable file counts as none
-            lineage = None
-        parents[view.name] = lineage.parent if lineage else None
-        number[view.name] = lineage.generation if lineage else 0
-    related = [v for v in views if parents[v.name] in parents or v.name in parents.values()]
-    return sorted(related, key=lambda view: number[view.name])
+    by_folder = {folder.resolve(): view for view in views if (folder := run_folder(view)) is not None}
+    return [by_folder[folder] for folder in clone_chain([*by_folder])]
 
 
 def generalisation_matrix(driven: Sequence[tuple[str, str | None, Mapping[str, float]]]) -> Chart | None:
@@ -227,10 +217,10 @@ def stored_completion(run: Path) -> dict[str, float]:
     by_track: dict[str, float] = {}
     for file in sorted((run / EVALUATIONS).glob("*.json")):
         try:
-            groups: list[dict[str, Any]] = json.loads(file.read_text(encoding="utf-8"))["groups"]
+            groups: list[dict[str, Any]] = read_json(file, "what `evaluate` writes there")["groups"]
             usual = [group for group in groups if group["condition"] == "usual"]
             by_track |= {str(group["track"]): float(group["completion"]["mean"]) for group in usual}
-        except (OSError, ValueError, TypeError, KeyError):
+        except (ValueError, TypeError, KeyError):
             continue
     return by_track
 
