@@ -51,12 +51,18 @@ def open_user_file(path: str | Path, accepted: str, most_bytes: int) -> IO[bytes
         BadInput: it is missing, not a regular file (a pipe or a device never ends), larger, or cannot be read.
     """
     with reading(path, accepted):
+        return plain_file(path, accepted, most_bytes).open("rb")
+
+
+def plain_file(path: str | Path, accepted: str, most_bytes: int) -> Path:
+    """Return the path of a file that a library will open; arguments and errors as for `open_user_file`."""
+    with reading(path, accepted):
         status = Path(path).stat()
-        if not stat.S_ISREG(status.st_mode):
-            kind = _KINDS.get(stat.S_IFMT(status.st_mode), "no file")
-            raise BadInput(path, f"is {kind}", accepted)
-        _check_size(path, status.st_size, accepted, most_bytes)
-        return Path(path).open("rb")
+    if not stat.S_ISREG(status.st_mode):
+        kind = _KINDS.get(stat.S_IFMT(status.st_mode), "no file")
+        raise BadInput(path, f"is {kind}", accepted)
+    _check_size(path, status.st_size, accepted, most_bytes)
+    return Path(path)
 
 
 def read_bytes(path: str | Path, accepted: str, most_bytes: int = SETTINGS_BYTES) -> bytes:

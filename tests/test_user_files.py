@@ -1,9 +1,12 @@
 """The one reader of files that a user gave."""
 
+import os
 from pathlib import Path
 
 import pytest
 
+from deepracer_exp.analysis.charts.runs import stored_completion
+from deepracer_exp.aws.models.archive import read_model
 from deepracer_exp.aws.models.hyperparameters import read_hyperparameters
 from deepracer_exp.aws.models.model_metadata import read_model_metadata
 from deepracer_exp.aws.worlds.routes import read_knots, read_route
@@ -12,7 +15,11 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.files import read_yaml
 from deepracer_exp.lookup.best import read_best_of_sweep
 from deepracer_exp.rewards.source import load_reward_source
+from deepracer_exp.runs.checkpoint_files import pinned, verify
 from deepracer_exp.runs.files import read_config, read_metrics
+from deepracer_exp.runs.labels import read_labels
+from deepracer_exp.runs.recording import read_log
+from deepracer_exp.runs.trace import read_evaluation_others, read_trace
 from tests.hostile_files import KINDS, PLACES, make
 
 
@@ -29,6 +36,13 @@ READERS = {
     "config.yaml": lambda path: read_config(path.parent),
     "metrics.jsonl": read_metrics,
     "best_of_sweep.json": lambda path: read_best_of_sweep(path.parent),
+    "hashes.json": lambda path: verify(path.parent),
+    "pinned.json": lambda path: pinned(path.parent),
+    "labels.json": lambda path: read_labels(path.parent),
+    "00001-iteration.parquet": lambda path: read_trace(path.parent),
+    "others.parquet": lambda path: read_evaluation_others(path.parent),
+    "model.tar.gz": lambda path: read_model(str(path), "best"),
+    "job.log": read_log,
 }
 
 
@@ -56,3 +70,10 @@ def test_aliases_count_each_time_and_may_be_used(tmp_path):
     path.write_text("a: &a [" + "1, " * 400 + "]\nb: &b [" + "*a, " * 400 + "]\nc: *b\n")
     with pytest.raises(BadInput, match="more than 100,000 values"):
         read_yaml(path, "YAML")
+
+
+@pytest.mark.timeout(20)
+def test_a_pipe_among_the_evaluations_of_a_run_is_left_out(tmp_path):
+    (tmp_path / "evaluations").mkdir()
+    os.mkfifo(tmp_path / "evaluations" / "1.json")
+    assert stored_completion(tmp_path) == {}

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
+from deepracer_exp.files import LOG_BYTES, open_user_file
+
 READ_ERRORS = (OSError, EOFError, zlib.error, lzma.LZMAError, tarfile.TarError, zipfile.BadZipFile)
 """Errors of reading a file or a member of an archive."""
 ZIP = (b"PK\x03\x04", b"PK\x05\x06")
@@ -67,8 +69,12 @@ class ArchiveMember:
 
 
 def open_archive(path: Path) -> Archive:
-    """Open a tar or zip archive."""
-    with path.open("rb") as file:
+    """Open a tar or zip archive.
+
+    Raises:
+        BadInput: it is not a plain file, or too large.
+    """
+    with open_user_file(path, "an archive", LOG_BYTES) as file:
         zipped = file.read(4) in ZIP
     return zipfile.ZipFile(path) if zipped else tarfile.open(path, "r:*", tarinfo=_SmallHeader)
 

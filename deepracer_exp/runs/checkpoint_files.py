@@ -7,13 +7,18 @@ import shutil
 from contextlib import suppress
 from pathlib import Path
 
+from pydantic import TypeAdapter
+
 from deepracer_exp.errors import BadInput
-from deepracer_exp.files import atomic_write
+from deepracer_exp.files import LOG_BYTES, atomic_write, open_user_file, read_json, read_json_as, read_text
+
+from .files import WRITTEN
 
 HASHES = "hashes.json"
 MANIFEST = "manifest.json"
 LINKS = ("best", "last")
 _PINNED = "pinned.json"
+_PINS = TypeAdapter(dict[str, list[str]])
 
 
 def write_hashes(folder: Path) -> None:
@@ -29,7 +34,7 @@ def verify(folder: Path) -> None:
         BadInput: a file is missing, was added or changed, or cannot be read.
     """
     try:
-        wanted = dict(json.loads((folder / HASHES).read_text(encoding="utf-8")))
+        wanted = dict(read_json(folder / HASHES, WRITTEN))
         hashes = {path: _sha256(folder / path) for path in _files(folder)}
     except (OSError, ValueError, TypeError) as error:
         raise BadInput(folder, f"corrupt: {HASHES} cannot be used: {error}") from error
@@ -50,9 +55,9 @@ def restore_links(folder: Path) -> None:
             continue
         with suppress(OSError, ValueError, KeyError, TypeError):
             if path.is_file():
-                name = path.read_text(encoding="utf-8")
+                name = read_text(path, WRITTEN)
             else:
-                manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
+                manifest = read_json(path / MANIFEST, WRITTEN)
                 name = f"{int(manifest['metadata']['iteration']):06d}"
             if not re.fullmatch(r"\d{6,9}", name):
                 continue
@@ -125,22 +130,17 @@ def pinned(checkpoints: Path) -> dict[str, list[str]]:
     Raises:
         BadInput: their file cannot be read.
     """
-    file = checkpoints / _PINNED
-    if not file.exists():
-        return {}
     try:
-        return {
-            str(name): list(reasons) for name, reasons in json.loads(file.read_text(encoding="utf-8")).items()
-        }
-    except (OSError, ValueError, AttributeError) as error:
-        raise BadInput(file, f"cannot be read: {error}; nothing in {checkpoints} is removed") from error
+        return read_json_as(checkpoints / _PINNED, _PINS, "a clone or `runs promote`") or {}
+    except BadInput as error:
+        raise BadInput(f"{error}; nothing in {checkpoints} is removed") from error
 
 
 def _files(folder: Path) -> list[str]:
-    files = (path for path in folder.rglob("*") if path.is_file())
+    files = (path for path in folder.rglob("*") if not path.is_dir())
     return sorted(path.relative_to(folder).as_posix() for path in files if path != folder / HASHES)
 
 
 def _sha256(file: Path) -> str:
-    with file.open("rb") as opened:
+    with open_user_file(file, WRITTEN, LOG_BYTES) as opened:
         return hashlib.file_digest(opened, "sha256").hexdigest()

@@ -9,6 +9,7 @@ from typing import Any
 from torchrl.checkpoint import Checkpoint, CheckpointError, StateDictCheckpointAdapter
 
 from deepracer_exp.errors import BadInput
+from deepracer_exp.files import LOG_BYTES, plain_file
 
 from .checkpoint_files import HASHES, MANIFEST, verify
 
@@ -99,7 +100,7 @@ def _check_archive(file: Path) -> None:
     """Refuse an archive with anything but tensors, or one that takes more memory than it has bytes."""
     size = file.stat().st_size
     try:
-        with zipfile.ZipFile(file) as archive:
+        with zipfile.ZipFile(plain_file(file, "tensors", LOG_BYTES)) as archive:
             foreign = [name for name in archive.namelist() if not _MEMBER.fullmatch(name)]
             unpacked = sum(member.file_size for member in archive.infolist())
     except (zipfile.BadZipFile, OSError, EOFError) as error:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from deepracer_exp.files import atomic_write
+from deepracer_exp.files import atomic_write, read_json
 
 from .files import CRASH_DUMPS
 
@@ -39,9 +39,7 @@ def write_crash_dump(run_dir: Path, error: BaseException, worker: int | None = N
 def read_crash_dump(run_dir: Path, worker: int) -> str | None:
     """Return the line a worker left behind, None where it left none."""
     path = run_dir / CRASH_DUMPS / f"worker-{worker}.json"
-    if not path.is_file():
-        return None
-    return str(json.loads(path.read_text(encoding="utf-8"))["message"])
+    return str(read_json(path, "what a worker writes there")["message"]) if path.exists() else None
 
 
 def _plain(value: Any) -> Any:

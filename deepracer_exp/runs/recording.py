@@ -32,8 +32,9 @@ from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.env.placement import PlacedOthers, read_placements
 from deepracer_exp.env.trace import EPISODE_STATUS, SCHEMA
 from deepracer_exp.errors import BadInput
+from deepracer_exp.files import RECORD_BYTES, read_text
 
-from .files import CONFIG, METRICS, REWARD, SUMMARY, TRACE, is_run, read_config, read_object
+from .files import CONFIG, METRICS, REWARD, SUMMARY, TRACE, WRITTEN, is_run, read_config, read_object
 from .result import IN_TRAINING, RunResult, read_result
 from .trace import (
     UNREADABLE,
@@ -376,9 +377,9 @@ def _track(config: Mapping[str, Any]) -> str | None:
 
 def _text(file: Path, problems: list[LogProblem], files: list[Path]) -> str:
     try:
-        text = file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        problems.append(LogProblem(str(file), None, f"cannot be read: {_one_line(error)}"))
+        text = read_text(file, WRITTEN, RECORD_BYTES)
+    except BadInput as error:
+        problems.append(LogProblem(str(file), None, error.without(file)))
         return ""
     files.append(file)
     return text

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -19,6 +20,7 @@ from deepracer_exp.env.placement import SCHEMA as OTHERS_SCHEMA
 from deepracer_exp.env.placement import PlacedOthers, read_placements
 from deepracer_exp.env.trace import SCHEMA, TRACE_COLUMNS
 from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.files import LOG_BYTES, plain_file
 
 from .files import read_config
 
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
 _ENDING, _OTHERS_ENDING, _OPEN_ENDING = "-iteration.parquet", "-others.parquet", "-open.parquet"
 EVALUATION_OTHERS = "others.parquet"
 """The others of an evaluation, beside the control steps in its folder; the file says among whom it raced."""
+_ACCEPTED = "a complete Parquet file of a run"
 _RACE: TypeAdapter[RaceConfig] = TypeAdapter(RaceConfig)
 DECIMALS = {
     **dict.fromkeys(("X", "Y", "yaw", "track_len"), 4),
@@ -237,11 +240,11 @@ def read_evaluation_others(folder: Path) -> PlacedOthers | None:
         BadInput: the file is incomplete or of another kind.
     """
     file = folder / EVALUATION_OTHERS
-    if not file.is_file():
+    if not os.path.lexists(file):
         return None
     table = _read_others(file)
     try:
-        written = pq.read_schema(file).metadata or {}
+        written = pq.read_schema(plain_file(file, _ACCEPTED, LOG_BYTES)).metadata or {}
         race = _RACE.validate_json(written[b"race"])
         period_s = float(written[b"period_s"])
     except (KeyError, ValueError) as error:
@@ -251,7 +254,7 @@ def read_evaluation_others(folder: Path) -> PlacedOthers | None:
 
 def _read_others(path: Path) -> pa.Table:
     try:
-        table = pq.read_table(path)
+        table = pq.read_table(plain_file(path, _ACCEPTED, LOG_BYTES))
         # Files of races without rivals may not have their columns.
         for field in OTHERS_SCHEMA:
             if field.name not in table.column_names and field.name.startswith(("rival_", "first_step")):
@@ -259,9 +262,7 @@ def _read_others(path: Path) -> pa.Table:
         return table.select(OTHERS_SCHEMA.names).cast(OTHERS_SCHEMA)
     except (OSError, pa.ArrowInvalid, KeyError, ValueError) as error:
         reason = " ".join(str(error).split())
-        raise BadInput(
-            path, f"not where the others were ({reason})", "a complete Parquet file of a run"
-        ) from error
+        raise BadInput(path, f"not where the others were ({reason})", _ACCEPTED) from error
 
 
 def rewind_trace(folder: Path, iteration: int) -> None:
@@ -278,7 +279,7 @@ UNREADABLE = (OSError, pa.ArrowException, KeyError, ValueError)
 
 def open_trace_file(path: Path) -> pq.ParquetFile:
     """Open one file of a trace for `stored_column`; raises `UNREADABLE`."""
-    return pq.ParquetFile(path, pre_buffer=False)
+    return pq.ParquetFile(plain_file(path, _ACCEPTED, LOG_BYTES), pre_buffer=False)
 
 
 def stored_column(file: pq.ParquetFile, name: str) -> pa.ChunkedArray:

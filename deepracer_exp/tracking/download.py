@@ -16,10 +16,20 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import urlsplit
 
-from deepracer_exp.errors import BadInput, reading, writing
+from deepracer_exp.errors import BadInput, writing
+from deepracer_exp.files import read_json
 from deepracer_exp.lifeline import running
 from deepracer_exp.runs.checkpoint_files import HASHES, checkpoint_sha256, verify
-from deepracer_exp.runs.files import CHECKPOINTS, CONFIG, METRICS, OVERRIDES, PROVENANCE, REWARD, SUMMARY
+from deepracer_exp.runs.files import (
+    CHECKPOINTS,
+    CONFIG,
+    METRICS,
+    OVERRIDES,
+    PROVENANCE,
+    REWARD,
+    SUMMARY,
+    WRITTEN,
+)
 
 from .calls import StoreRefusedError, StoreUnavailableError, store_errors
 from .store import Store, client_of
@@ -112,8 +122,7 @@ def _fetch(wanted: Download, folder: Path) -> None:
     model = client.get_logged_model(wanted.model_id)
     files = _files_of(model.artifact_location, wanted.uri)
     _fetch_file(files, f"{_CHECKPOINT}/{HASHES}", folder, wanted.most_bytes)
-    with reading(HASHES, why="is not valid JSON"):
-        hashes = json.loads((folder / _CHECKPOINT / HASHES).read_text(encoding="utf-8"))
+    hashes = read_json(folder / _CHECKPOINT / HASHES, WRITTEN)
     for name in _checked_names(hashes):
         _fetch_file(files, f"{_CHECKPOINT}/{name}", folder, wanted.most_bytes)
     (folder / CHECKPOINTS).mkdir()

@@ -18,9 +18,10 @@ from urllib.parse import urlsplit
 from deepracer_exp.config.overrides import group_of
 from deepracer_exp.config.running import BudgetConfig
 from deepracer_exp.errors import BadInput, count
+from deepracer_exp.files import RECORD_BYTES, open_user_file, read_bytes
 from deepracer_exp.lifeline import given_environment, running
 from deepracer_exp.lookup.next_steps import command_line, run_word
-from deepracer_exp.runs.files import METRICS, SUMMARY, read_config, read_object
+from deepracer_exp.runs.files import METRICS, SUMMARY, WRITTEN, read_config, read_object
 from deepracer_exp.runs.result import FAILED, INTERRUPTED, Ending
 
 _log = logging.getLogger(__name__)
@@ -276,9 +277,9 @@ def _last_row(run: Path) -> dict[str, Any]:
     """Return the summary of a run, or its last whole row if it has none; empty where nothing can be read."""
     try:
         if (run / SUMMARY).exists():
-            text = (run / SUMMARY).read_bytes()
+            text = read_bytes(run / SUMMARY, WRITTEN, RECORD_BYTES)
         else:  # it is running, or was killed
-            with (run / METRICS).open("rb") as file:
+            with open_user_file(run / METRICS, WRITTEN, RECORD_BYTES) as file:
                 file.seek(max(0, file.seek(0, 2) - _TAIL_BYTES))
                 text = file.read().split(b"\n")[-2]
         row = dict(json.loads(text))

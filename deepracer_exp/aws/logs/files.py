@@ -6,7 +6,6 @@ import gzip
 import lzma
 import os
 import re
-import stat
 import tarfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -167,11 +166,10 @@ def log_folder(path: Path) -> Iterator[LogFolder]:
         BadInput: nothing is there, or it cannot be opened.
     """
     try:
-        mode = path.stat().st_mode
-        if not (stat.S_ISDIR(mode) or stat.S_ISREG(mode)):
-            raise BadInput(path, "is neither a file nor a folder", "logs of the service or a run's folder")
+        if not path.exists():
+            raise BadInput(path, "no such file or folder", _ACCEPTED)
         with contextlib.ExitStack() as opened:
-            if stat.S_ISDIR(mode):
+            if path.is_dir():
                 yield _walk(path, opened)
             elif _is_packed(path):
                 listed = LogFolder()
@@ -180,8 +178,6 @@ def log_folder(path: Path) -> Iterator[LogFolder]:
                 yield listed
             else:
                 yield LogFolder([_plain(path, named_parts(path)[-3:])])
-    except FileNotFoundError as error:
-        raise BadInput(path, "no such file or folder", _ACCEPTED) from error
     except (*READ_ERRORS, ValueError) as error:
         if isinstance(error, BadInput):
             raise
@@ -228,7 +224,7 @@ def _plain(path: Path, parts: tuple[str, ...]) -> LogFile:
 
 
 def _is_packed(path: Path) -> bool:
-    with path.open("rb") as file:
+    with open_user_file(path, _ACCEPTED, LOG_BYTES) as file:
         head = file.read(512)
     return head.startswith((*_MARKS, *ZIP)) or head[257:262] == b"ustar"
 
@@ -271,7 +267,7 @@ def _unpack(
         with open_archive(path) as archive:
             members = _members(path, archive, archives)
     except tarfile.ReadError:
-        with path.open("rb") as file:
+        with open_user_file(path, _ACCEPTED, LOG_BYTES) as file:
             head = file.read(8)
         opener = next((_OPEN[ending] for mark, ending in _MARKS.items() if head.startswith(mark)), None)
         if opener is None:

@@ -29,7 +29,7 @@ from deepracer_exp.aws.archives import (
     reason_of,
 )
 from deepracer_exp.errors import BadInput
-from deepracer_exp.files import LOG_BYTES, SETTINGS_BYTES
+from deepracer_exp.files import LOG_BYTES, SETTINGS_BYTES, open_user_file
 
 from .graph_def import GRAPH_BYTES, read_weights
 from .protobuf import field
@@ -202,15 +202,10 @@ def _choose(files: _Files, weights: list[str], checkpoint: str) -> tuple[str, st
 
 @contextmanager
 def _opened(path: str) -> Iterator[_Files]:
-    status = Path(path).stat()
-    if stat.S_ISDIR(status.st_mode):
+    if Path(path).is_dir():
         yield _folder(path)
         return
-    if not stat.S_ISREG(status.st_mode):
-        raise BadInput(path, "is neither a file nor a folder", _ACCEPTED)
-    if status.st_size > LOG_BYTES:
-        raise BadInput(path, f"is larger than {LOG_BYTES // 2**30} GiB", _ACCEPTED)
-    with Path(path).open("rb") as file:
+    with open_user_file(path, _ACCEPTED, LOG_BYTES) as file:
         head = file.read(512)
     if not (head.startswith((*ZIP, b"\x1f\x8b")) or head[257:262] == b"ustar"):
         raise BadInput(path, "is no archive", _ACCEPTED)
@@ -222,7 +217,7 @@ def _folder(path: str) -> _Files:
     """List the files of a folder; links are not followed."""
 
     def opened(name: str) -> IO[bytes]:
-        return Path(path, name).open("rb")
+        return open_user_file(Path(path, name), _ACCEPTED, LOG_BYTES)
 
     files = _Files(path, opened, math.inf)
     for folder, _, names in os.walk(path):
