@@ -6,8 +6,9 @@ import os
 import stat
 import uuid
 from collections.abc import Callable
+from io import BufferedReader
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import yaml
 
@@ -42,7 +43,7 @@ _KINDS = {
 }
 
 
-def open_user_file(path: str | Path, accepted: str, most_bytes: int) -> IO[bytes]:
+def open_user_file(path: str | Path, accepted: str, most_bytes: int) -> BufferedReader:
     """Open a file for reading.
 
     `accepted` is for messages; a file of its kind can have `most_bytes`.

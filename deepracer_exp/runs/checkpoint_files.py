@@ -37,7 +37,7 @@ def verify(folder: Path) -> None:
         wanted = dict(read_json(folder / HASHES, WRITTEN))
         hashes = {path: _sha256(folder / path) for path in _files(folder)}
     except (OSError, ValueError, TypeError) as error:
-        raise BadInput(folder, f"corrupt: {HASHES} cannot be used: {error}") from error
+        raise BadInput(folder, f"corrupt: {folder / HASHES} cannot be used: {error}") from error
     if hashes != wanted:
         changed = sorted(set(hashes.items()) ^ set(wanted.items()))
         raise BadInput(folder, f"corrupt: {changed[0][0]} is not as it was written")

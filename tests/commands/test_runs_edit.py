@@ -124,7 +124,7 @@ def test_what_is_needed_or_elsewhere_is_never_deleted(season, call, tmp_path):
     (season.runs_dir / "linked").symlink_to(outside.parent)
     for name, words in (
         (run.name, "registered as season"),
-        (other.name, "cloned to 20261103-120000-c"),
+        (other.name, "cloned to season/20261103-120000-c"),
         (str(outside), "is not a run's own folder"),
         ("20261105-120000-e", "is not a run's own folder"),
         (f"linked/{outside.name}", "is not a run's own folder"),
@@ -144,7 +144,7 @@ def test_a_label_that_a_server_did_not_take_is_sent_later(recorded, call, client
     (recorded / "tracking.json").write_text(json.dumps(tracked | {"store": away}))
     ended = call("runs", "tag", recorded.name, "car=red", f"tracking.uri={away}")
     assert ended.code == 0
-    assert f"send it later: deepracer-exp runs send {recorded.name}" in ended.stderr
+    assert f"send it later: deepracer-exp runs send runs/season/{recorded.name}" in ended.stderr
     assert json.loads((recorded / "tracking.json").read_text())["complete"] is False
     assert json.loads((recorded / "labels.json").read_text())["tags"] == {"car": "red"}
 
