@@ -7,6 +7,8 @@ from contextlib import contextmanager
 
 _LONGEST_LINE = 4000
 """Characters of a message; the longest lists of options have fewer."""
+_LONGEST_READ = 100_000
+"""Characters of a message that are looked at: of megabytes that would take seconds."""
 _HEAD, _TAIL = 120, 60
 _LONG_VALUE = re.compile(r"\S{400,}|(?<!\w)('|\")(?:(?!\1).){400,}\1(?!\w)")
 """A value that a message repeats: one word, or quoted. What would be accepted is neither."""
@@ -48,6 +50,10 @@ class RunFailed(RuntimeError):  # noqa: N818 - reads as what it is at the raise 
     """A run that had started cannot continue: reward error, non-finite value, lost worker, full disk."""
 
     exit_code = 3
+
+    def __init__(self, reason: object) -> None:
+        """Take the line that says why."""
+        super().__init__(_one_line(str(reason)))
 
 
 @contextmanager
@@ -111,14 +117,16 @@ def _reason(error: Exception) -> str:
 
 def _one_line(text: str) -> str:
     """Return a text without line breaks and control characters, and without the middle of what is very long."""
+    text = _without_middle(text, _LONGEST_READ)
     line = "".join(
         letter if letter.isprintable() else repr(letter)[1:-1] for letter in " ".join(text.split())
     )
     line = _LONG_VALUE.sub(lambda value: f"{value[0][:_HEAD]} … {value[0][-_TAIL:]}", line)
-    if len(line) <= _LONGEST_LINE:
-        return line
-    half = _LONGEST_LINE // 2
-    return f"{line[:half]} … {line[-half:]}"
+    return _without_middle(line, _LONGEST_LINE)
+
+
+def _without_middle(text: str, most: int) -> str:
+    return text if len(text) <= most else f"{text[: most // 2]} … {text[-(most // 2) :]}"
 
 
 def count(number: int, what: str) -> str:

@@ -8,7 +8,7 @@ import pytest
 
 import deepracer_exp
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.errors import BadInput, Unknown, reading
+from deepracer_exp.errors import BadInput, RunFailed, Unknown, reading
 from deepracer_exp.files import read_json, read_yaml
 from deepracer_exp.rewards.source import load_reward_source
 from tests.conftest import refused
@@ -102,3 +102,13 @@ def _reads(name):
         return isinstance(node, ast.Attribute) and node.attr in ways and is_text(node.value)
 
     return reads
+
+
+@pytest.mark.parametrize("kind", [BadInput, RunFailed])
+@pytest.mark.parametrize("piece", ["x", "x y ", "\x1b", "\n", "'x ", "\"'"])
+def test_a_value_of_megabytes_leaves_its_line_short_and_its_reason_readable(kind, piece):
+    line = str(kind(f"key={piece * 1_000_000}: is no number"))
+    assert len(line) < 4100
+    assert line.startswith("key=")
+    assert line.endswith(": is no number")
+    assert line.isprintable()
