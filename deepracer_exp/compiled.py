@@ -6,10 +6,13 @@ update of the tyres alone cars would still drive on the old ones.
 
 import functools
 import hashlib
+import os
+import tempfile
 from pathlib import Path
 from types import FunctionType
 from typing import Any
 
+import numba
 import numpy as np
 from numba import njit
 from numba.core.caching import (
@@ -75,3 +78,18 @@ def _of_package(locator: Any) -> Any:
 CacheImpl._locator_classes[:0] = map(
     _of_package, (UserProvidedCacheLocator, InTreeCacheLocator, UserWideCacheLocator)
 )
+
+
+def _can_keep() -> bool:
+    """Return whether there is a folder for compiled code: in the package, or in the user's own."""
+    try:
+        njit(cache=True)(_can_keep)
+    except RuntimeError:
+        return False
+    return True
+
+
+if not _can_keep():
+    # Of this process and those that it starts: what others could write into would be run.
+    _for_now = tempfile.TemporaryDirectory(prefix="compiled-", ignore_cleanup_errors=True)
+    numba.config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"] = _for_now.name
