@@ -1,27 +1,31 @@
 # PYTHON_ARGCOMPLETE_OK
 """The command line; each command imports what it needs when it runs, so that `--help` and completion are fast."""
 
-import argparse
-import atexit
-import contextlib
-import os
-import select
-import signal
-import sys
-import threading
-import time
-import traceback
-from collections.abc import Callable, Sequence
-from types import FrameType
-from typing import NoReturn
+from deepracer_exp.ctrl_c import ending_at_once, interrupt, set_handler
 
-from deepracer_exp import __version__
-from deepracer_exp.addresses import redact, without_passwords
-from deepracer_exp.commands import actions, analyze, compare, evaluate, files, runs, tracks, train
-from deepracer_exp.errors import BadInput, RunFailed, nearest
-from deepracer_exp.lean_imports import import_lean
-from deepracer_exp.lifeline import die_with_parent, guard_imports
-from deepracer_exp.scratch import own_scratch
+with ending_at_once():
+    import argparse
+    import atexit
+    import contextlib
+    import os
+    import select
+    import signal
+    import sys
+    import threading
+    import time
+    import traceback
+    from collections.abc import Callable, Sequence
+    from types import FrameType
+    from typing import NoReturn
+
+    from deepracer_exp import __version__
+    from deepracer_exp.addresses import redact, without_passwords
+    from deepracer_exp.commands import actions, analyze, compare, evaluate, files, runs, tracks, train
+    from deepracer_exp.errors import BadInput, RunFailed, nearest
+    from deepracer_exp.lean_imports import import_lean
+    from deepracer_exp.lifeline import die_with_parent, guard_imports
+    from deepracer_exp.scratch import own_scratch
+    from deepracer_exp.streams import Output, exit_code, standard_streams
 
 _COMMANDS = (train, runs, evaluate, analyze, compare, files, tracks, actions)
 """In the order of `--help`."""
@@ -44,22 +48,32 @@ def main(arguments: Sequence[str] | None = None) -> None:
     # Read when the library of torch's threads is loaded. By default a thread that has nothing to do keeps its core busy
     # for milliseconds: beside other work an update from pictures takes twice as long, or twenty times.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    args = argparse.Namespace()
     words = without_passwords(list(sys.argv[1:] if arguments is None else arguments))
-    if arguments is None:
-        guard_imports()
-        import_lean()
-        sys.argv[1:] = words  # the run's folder keeps them
+    with standard_streams() as output:
+        if arguments is not None:
+            sys.exit(_call(_parsed(words, output), output))
+        with ending_at_once():
+            guard_imports()
+            import_lean()
+            sys.argv[1:] = words  # the run's folder keeps them
+            args = _parsed(words, output, has_own_process=True)
+            own_scratch()
+            is_supervised = getattr(args, "runs_rewards", False)
+            code = supervised(lambda: _call(args, output)) if is_supervised else _call(args, output)
+        with ending_at_once():
+            end_process(code)
+
+
+def _parsed(words: Sequence[str], output: Output, *, has_own_process: bool = False) -> argparse.Namespace:
+    """Return the parsed arguments; exit if they cannot be used, or if help or the version was printed."""
     try:
         args = parse(words)
     except BadInput as error:
-        sys.exit(_fail(error, BadInput.exit_code, args))
-    args.has_own_process = arguments is None
-    if arguments is None:
-        own_scratch()
-    if arguments is not None:
-        sys.exit(_call(args))
-    end_process(supervised(lambda: _call(args)) if getattr(args, "runs_rewards", False) else _call(args))
+        sys.exit(_fail(error, BadInput.exit_code, argparse.Namespace()))
+    except SystemExit as end:
+        sys.exit(exit_code(output, int(end.code or 0)))
+    args.has_own_process = has_own_process
+    return args
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
@@ -119,22 +133,18 @@ class _Parser(argparse.ArgumentParser):
             )
 
 
-def _call(args: argparse.Namespace) -> int:
+def _call(args: argparse.Namespace, output: Output) -> int:
     """Run the parsed command and return its exit code."""
     try:
-        code = int(args.command(args))
-        sys.stdout.flush()  # an error of writing is raised here, not at interpreter exit
-        return code
+        if args.has_own_process:
+            set_handler(interrupt)
+        return exit_code(output, int(args.command(args)))
     except BadInput as error:
         return _fail(error, BadInput.exit_code, args)
     except RunFailed as error:
         return _fail(error, RunFailed.exit_code, args)
     except KeyboardInterrupt:
         return 130
-    except BrokenPipeError:
-        # The reader of our output (`| head`) has closed it; Python must not try to write the rest.
-        sys.stderr.close()
-        return 141
 
 
 def end_process(code: int) -> NoReturn:
@@ -213,6 +223,8 @@ def supervised(call: Callable[[], int]) -> int:
     if -ended in _SIGNALS:
         return 128 - ended
     how = f"left it with exit code {ended}" if ended >= 0 else f"was ended by {signal.Signals(-ended).name}"
+    if interruptions and ended == 128 + interruptions[0]:
+        return ended
     if interruptions:
         print(f"deepracer-exp: interrupted; the process {how} before the command was done", file=sys.stderr)
         return 128 + interruptions[0]

@@ -184,12 +184,12 @@ def _against_log(args: argparse.Namespace, item: Item, place: Path, checkpoint: 
     recording = read_recording(place)
     view = prepare_races(recording, args.track)
 
-    from rich.console import Console
-
     from deepracer_exp.reports.driven_against_log import race_against_log
 
+    from .terminal import Terminal
+
     with warnings_on_stderr():
-        both = race_against_log(run, view, args.track, Console(stderr=True, highlight=False))
+        both = race_against_log(run, view, args.track, Terminal(stderr=True, highlight=False))
     learned = None
     if (run.path / TRACE).is_dir() and (args.replay is not None or prepare(recording, args.track).trained):
         views = [prepare(read_log(run.path)), prepare(recording, args.track)]

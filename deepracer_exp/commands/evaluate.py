@@ -151,13 +151,13 @@ def _evaluate(args: argparse.Namespace) -> int:
     if video is not None:
         choose_graphics()
 
-    from rich.console import Console
-
     from deepracer_exp.evaluation.evaluate import evaluate_run
 
-    out = Console(width=None if sys.stdout.isatty() else 160)
+    from .terminal import Terminal
+
+    out = Terminal(width=None if sys.stdout.isatty() else 160)
     with warnings_on_stderr():
-        evaluate_run(plan, video, out, Console(stderr=True), trace)
+        evaluate_run(plan, video, out, Terminal(stderr=True), trace)
     return 0
 
 
@@ -181,13 +181,13 @@ def _check(args: argparse.Namespace) -> int:
         )
     _refuse_rival(plan, "--car")
 
-    from rich.console import Console
-
     from deepracer_exp.export.car_check import check_run
+
+    from .terminal import Terminal
 
     with warnings_on_stderr():
         picture = None if args.output is None else Path(args.output)
-        check_run(plan, picture, table_console(160), Console(stderr=True))
+        check_run(plan, picture, table_console(160), Terminal(stderr=True))
     return 0
 
 
@@ -241,13 +241,13 @@ def _watch(args: argparse.Namespace) -> int:
     if not args.live:
         plan = _planned(args, run, overrides)
 
-        from rich.console import Console
-
         from deepracer_exp.reports.watch import film_run
+
+        from .terminal import Terminal
 
         file = None if args.output is None else Path(args.output)
         with warnings_on_stderr():
-            film_run(plan.run, plan.config.evaluation, file, Console(), Console(stderr=True), plan.rival)
+            film_run(plan.run, plan.config.evaluation, file, Terminal(), Terminal(stderr=True), plan.rival)
         return 0
     from deepracer_exp.reports.live_server import LiveServer
 
@@ -273,12 +273,12 @@ def _film_drive(args: argparse.Namespace, place: Path, run: str | None, override
     check_file("--output", args.output, ".mp4")
     log, policy = read_drive(place, run, overrides)
 
-    from rich.console import Console
-
     from deepracer_exp.reports.car_film import film_drive
 
+    from .terminal import Terminal
+
     file = Path(args.output or page_name("drive", log.name).with_suffix(".mp4"))
-    film_drive(file, log, policy, Console(stderr=True))
+    film_drive(file, log, policy, Terminal(stderr=True))
     print(f"  film  {file}")
     return 0
 
@@ -366,11 +366,11 @@ def _checkpoints(args: argparse.Namespace) -> int:
     check_file("--output", args.output, ".html")
     plan = _planned(args, *run_and_overrides(args))
 
-    from rich.console import Console
-
     from deepracer_exp.reports.checkpoint_comparison import show_checkpoints
 
-    progress = Console(stderr=True, highlight=False, markup=False)
+    from .terminal import Terminal
+
+    progress = Terminal(stderr=True, highlight=False, markup=False)
     with warnings_on_stderr():
         show_checkpoints(
             plan.run, plan.training_protocol, args.output, table_console(160), progress, plan.rival

@@ -178,12 +178,12 @@ def _export(args: argparse.Namespace) -> int:
 
         check_car(run.experiment)
 
-    from rich.console import Console
-
     from deepracer_exp.export.export import export
 
+    from .terminal import Terminal
+
     with warnings_on_stderr():
-        export(run, **chosen, output=args.output, out=Console(highlight=False, markup=False))
+        export(run, **chosen, output=args.output, out=Terminal(highlight=False, markup=False))
     return 0
 
 
@@ -217,11 +217,11 @@ def _validate(args: argparse.Namespace) -> int:
         trial = replace(plan, experiment=short, composition=short_composition)
         start_workers_early(experiment.collector.forks)
 
-    from rich.console import Console
-
     from deepracer_exp.validation.validate import validate_reward
 
-    return validate_reward(plan, trial, args.output, args.strict, Console(), Console(stderr=True))
+    from .terminal import Terminal
+
+    return validate_reward(plan, trial, args.output, args.strict, Terminal(), Terminal(stderr=True))
 
 
 def _trial_overrides(word: str) -> list[str]:

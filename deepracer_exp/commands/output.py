@@ -49,9 +49,9 @@ def check_file(flag: str, file: str | None, ending: str = "") -> None:
 
 def table_console(piped_width: int = 200) -> "Console":
     """Return a console for tables on standard output; a pipe has no width of its own."""
-    from rich.console import Console
+    from .terminal import Terminal
 
-    return Console(width=None if sys.stdout.isatty() else piped_width, highlight=False, markup=False)
+    return Terminal(width=None if sys.stdout.isatty() else piped_width, highlight=False, markup=False)
 
 
 def print_table(console: "Console", title: str | None, table: "Table") -> None:

@@ -184,17 +184,18 @@ def search_fastest(experiment: "Experiment", track: "Track") -> "FastestLap":
         BadInput: as for `Question.of`.
         RunFailed: no lap is possible within the limits.
     """
-    from rich.console import Console
     from rich.progress import Progress, TimeRemainingColumn
 
     from deepracer_exp.fastest.lap import Question, fastest_lap, kept_lap
+
+    from .terminal import Terminal
 
     question = Question.of(experiment, track)
     kept = kept_lap(question)
     if kept is not None:
         return kept
     columns = (*Progress.get_default_columns()[:3], TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+    with Progress(*columns, console=Terminal(stderr=True), transient=True) as progress:
         task = progress.add_task("fastest lap", total=1.0)
 
         def show(share: float, lap_time_s: float | None) -> None:
@@ -225,11 +226,12 @@ def _line_table(lap: "FastestLap") -> "pd.DataFrame":
 
 def _film(lap: "FastestLap", track: "Track", experiment: "Experiment", args: argparse.Namespace) -> None:
     import numpy as np
-    from rich.console import Console
 
     from deepracer_exp.evaluation.film import Lap
     from deepracer_exp.evaluation.race_protocol import Attempt
     from deepracer_exp.evaluation.video import write_video
+
+    from .terminal import Terminal
 
     attempt = Attempt(
         trial=0,
@@ -252,7 +254,7 @@ def _film(lap: "FastestLap", track: "Track", experiment: "Experiment", args: arg
         speed_mps=lap.column("speed_mps"),
         progress=lap.column("progress"),
     )
-    write_video(Path(args.video), film_lap, experiment.car, Console(stderr=True))
+    write_video(Path(args.video), film_lap, experiment.car, Terminal(stderr=True))
     print(f"\nfilm: {args.video}")
 
 

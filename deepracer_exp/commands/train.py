@@ -141,16 +141,16 @@ def _train(args: argparse.Namespace) -> int:
     print_start()
     start_workers_early(any(plan.experiment.collector.forks for plan in plans))
 
-    from rich.console import Console
-
     from deepracer_exp.training.run import run_training, try_out
+
+    from .terminal import Terminal
 
     if len(plans) > 1:
         for plan in plans:
             try_out(plan)
     outcomes = []
     for plan in plans:
-        outcome = run_training(plan, Console(stderr=True))
+        outcome = run_training(plan, Terminal(stderr=True))
         outcomes.append(outcome)
         if plan.experiment.debug and outcome.error is not None:
             traceback.print_exception(outcome.error)
@@ -191,12 +191,12 @@ def _continue(plan: "ResumePlan | TrainPlan") -> int:
     print_start()
     start_workers_early(plan.experiment.collector.forks)
 
-    from rich.console import Console
-
     from deepracer_exp.training.run import run_training
 
+    from .terminal import Terminal
+
     with warnings_on_stderr():
-        outcome = run_training(plan, Console(stderr=True))
+        outcome = run_training(plan, Terminal(stderr=True))
     print_result(outcome, plan.experiment.tracking)
     return outcome.exit_code
 
@@ -279,14 +279,14 @@ def _sweep(args: argparse.Namespace) -> int:
     print_start()
     start_workers_early(request.entry.sweep.executor.kind == "local", _WORKER)
 
-    from rich.console import Console
-
     from deepracer_exp.sweeps import PAGE_FILE
     from deepracer_exp.sweeps.report.best import complete_trials
     from deepracer_exp.sweeps.sweep import sweep
 
+    from .terminal import Terminal
+
     with warnings_on_stderr():
-        study, folder, code = sweep(plan, Console(stderr=True))
+        study, folder, code = sweep(plan, Terminal(stderr=True))
     if code:
         where = [word for word in args.overrides if word.startswith(("runs_dir=", "sweep.storage="))]
         line = shlex.join(["deepracer-exp", "sweep", f"study={study.study_name}", *where])

@@ -18,6 +18,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from deepracer_exp.analysis.charts.style import DARK, NARROW_WIDTH, Figure
+from deepracer_exp.streams import without_accounts
 
 if TYPE_CHECKING:
     from deepracer_exp.analysis.charts.figure import Chart
@@ -70,7 +71,7 @@ def figure_json(figure: Figure) -> str:
     Raises:
         ValueError: a number outside an array is not finite.
     """
-    return json.dumps(figure, default=_array, allow_nan=False, separators=(",", ":"))
+    return without_accounts(json.dumps(figure, default=_array, allow_nan=False, separators=(",", ":")))
 
 
 def _array(values: NDArray[np.float32]) -> dict[str, str] | list[float]:
@@ -127,6 +128,7 @@ def render(
         trim_blocks=True,
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
+        finalize=lambda value: without_accounts(value) if type(value) is str else value,
     )
     # The colour of a figure for CSS.
     environment.filters["themed"] = lambda color: f"light-dark({color}, {DARK.get(color.lower(), color)})"

@@ -1,0 +1,25 @@
+"""The console of all commands: what comes from a file reaches the terminal as text, never as an escape sequence."""
+
+import sys
+from collections.abc import Iterable
+from typing import Any
+
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
+from typing_extensions import override
+
+from deepracer_exp.streams import shown
+
+
+class Terminal(Console):
+    """A console of Rich whose cells and lines hold nothing that a terminal would obey; its own styles it does."""
+
+    def __init__(self, *, stderr: bool = False, **options: Any) -> None:
+        """Write to standard output or error; `options` are those of Rich's console."""
+        stream = sys.stderr if stderr else sys.stdout
+        super().__init__(file=getattr(stream, "as_is", stream), stderr=stderr, **options)
+
+    @override
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else Segment(shown(segment.text), segment.style)
