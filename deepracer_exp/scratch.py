@@ -10,7 +10,9 @@ import os
 import shutil
 import sys
 import tempfile
-from contextlib import suppress
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from multiprocessing import util
 from pathlib import Path
 
@@ -27,15 +29,12 @@ def own_scratch() -> None:
     usual one.
     """
     base = Path(tempfile.gettempdir())
-    for left in base.glob(f"{_PREFIX}*"):
-        _remove_if_unused(left)
+    clear(base, _PREFIX)
     if len(os.fsencode(base)) > _LONGEST_BASE:
         return
     with suppress(OSError):
         folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=base))
-        # Locked as long as this process or one that it forked lives; a command that cleared it away at this moment has
-        # left nothing to lock.
-        fcntl.flock(os.open(folder, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
+        _hold(folder)
         # After multiprocessing has removed its own (-100), and in this process, not in one that it forked.
         util.Finalize(None, shutil.rmtree, (folder, True), exitpriority=-200)
         tempfile.tempdir = str(folder)
@@ -43,13 +42,55 @@ def own_scratch() -> None:
             multiprocessing.current_process()._config["semprefix"] = f"/{folder.name}"  # type: ignore[attr-defined]
 
 
-def _remove_if_unused(folder: Path) -> None:
-    with suppress(OSError):  # of another user, or in use
-        opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-        try:
-            fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            for semaphore in _SHARED_MEMORY.glob(f"sem.{folder.name}-*"):
-                semaphore.unlink()
-            shutil.rmtree(folder)
-        finally:
-            os.close(opened)
+@contextmanager
+def folder_aside(parent: Path, prefix: str) -> Iterator[Path]:
+    """Make a folder for what is moved into place whole, with a name that begins with `prefix`; remove what is left.
+
+    What killed commands have left of such folders is removed, too.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+    clear(parent, prefix)
+    folder = parent / f"{prefix}{uuid.uuid4().hex}"
+    folder.mkdir()
+    held = _hold(folder)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        os.close(held)
+
+
+def clear(parent: Path, prefix: str) -> None:
+    """Remove the folders of this user whose names begin so and that no process holds, with their semaphores."""
+    for folder in parent.iterdir():
+        if not folder.name.startswith(prefix):
+            continue
+        with suppress(OSError):  # in use
+            opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+            try:
+                if os.fstat(opened).st_uid == os.getuid():
+                    fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    _remove_semaphores(folder.name)
+                    shutil.rmtree(folder)
+            finally:
+                os.close(opened)
+
+
+def _remove_semaphores(folder_name: str) -> None:
+    # Not by a pattern: the folder's name may hold any characters.
+    for semaphore in _SHARED_MEMORY.iterdir() if _SHARED_MEMORY.is_dir() else ():
+        if semaphore.name.startswith(f"sem.{folder_name}-"):
+            semaphore.unlink()
+
+
+def _hold(folder: Path) -> int:
+    """Lock a folder as long as this process or one that it forked lives; return what holds it.
+
+    Raises:
+        OSError: a command that clears has taken it at this moment.
+    """
+    opened = os.open(folder, os.O_RDONLY)
+    fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    return opened

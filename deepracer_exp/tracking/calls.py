@@ -31,14 +31,15 @@ class StoreRefusedError(Exception):
 
 
 class BoundedClient:
-    """A client of MLflow of which every call ends; in all they take at most `total_s`.
+    """A client of MLflow of which every call ends; in all, with what connects it, they take at most `total_s`.
 
     Its methods raise TimeoutError, which is an OSError, when their time is up.
     """
 
-    def __init__(self, client: Any, total_s: float | None = None) -> None:
-        self._client = client
+    def __init__(self, connect: Callable[[], Any], total_s: float | None = None) -> None:
+        """Connect, which counts, too."""
         self._end_by = None if total_s is None else time.monotonic() + total_s
+        self._client = self._call(connect)
 
     def __getattr__(self, name: str) -> Any:
         attribute = getattr(self._client, name)

@@ -7,14 +7,12 @@ import json
 import os
 import re
 import resource
-import shutil
 import subprocess
 import sys
-import tempfile
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
-from urllib.parse import urlsplit
 
 from deepracer_exp.errors import BadInput, writing
 from deepracer_exp.files import read_json
@@ -30,6 +28,7 @@ from deepracer_exp.runs.files import (
     SUMMARY,
     WRITTEN,
 )
+from deepracer_exp.scratch import folder_aside
 
 from .calls import StoreRefusedError, StoreUnavailableError, store_errors
 from .store import Store, client_of
@@ -71,10 +70,10 @@ def download(what: str, wanted: Download, store: Store, target: Path) -> None:
         BadInput: the store lacks a file, does not answer in time, or sends what is not the registered checkpoint.
     """
     what = f"{what}: MLflow ({store.shown})"
-    with writing(f"runs_dir={target.parent.parent}"):
-        target.parent.mkdir(parents=True, exist_ok=True)
-        aside = Path(tempfile.mkdtemp(prefix=".download-", dir=target.parent))
-    try:
+    with ExitStack() as stack:
+        with writing(f"runs_dir={target.parent.parent}"):
+            target.parent.mkdir(parents=True, exist_ok=True)
+            aside = stack.enter_context(folder_aside(target.parent, ".download-"))
         _run(what, wanted, aside)
         checkpoint = aside / CHECKPOINTS / wanted.checkpoint
         verify(checkpoint)
@@ -86,10 +85,7 @@ def download(what: str, wanted: Download, store: Store, target: Path) -> None:
                 place.parent.mkdir(exist_ok=True)
                 checkpoint.replace(place)
             else:
-                aside.chmod(0o755)
                 aside.replace(target)
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
 
 
 def _run(what: str, wanted: Download, folder: Path) -> None:
@@ -108,9 +104,10 @@ def _run(what: str, wanted: Download, folder: Path) -> None:
 
 def _fetch(wanted: Download, folder: Path) -> None:
     """Download everything into `folder`, laid out as a run."""
-    client = client_of(Store(wanted.uri, None, os.environ.get("MLFLOW_TRACKING_USERNAME")))
+    store = Store(wanted.uri, None, os.environ.get("MLFLOW_TRACKING_USERNAME"))
+    client = client_of(store)
     if wanted.with_run:
-        files = _files_of(client.get_run(wanted.run_id).info.artifact_uri, wanted.uri)
+        files = _files_of(client.get_run(wanted.run_id).info.artifact_uri, store)
         there = {file.path for file in files.list_artifacts()}
         if CONFIG not in there:
             raise StoreRefusedError(
@@ -120,7 +117,7 @@ def _fetch(wanted: Download, folder: Path) -> None:
             if name in there:  # an imported model has no metrics
                 _fetch_file(files, name, folder, wanted.most_bytes)
     model = client.get_logged_model(wanted.model_id)
-    files = _files_of(model.artifact_location, wanted.uri)
+    files = _files_of(model.artifact_location, store)
     _fetch_file(files, f"{_CHECKPOINT}/{HASHES}", folder, wanted.most_bytes)
     hashes = read_json(folder / _CHECKPOINT / HASHES, WRITTEN)
     for name in _checked_names(hashes):
@@ -129,20 +126,12 @@ def _fetch(wanted: Download, folder: Path) -> None:
     (folder / _CHECKPOINT).replace(folder / CHECKPOINTS / wanted.checkpoint)
 
 
-def _files_of(place: str, uri: str) -> Any:
-    """Return the files that MLflow keeps at a place.
-
-    Another server is refused as such a place: it would be given this user's password of MLflow.
-    """
+def _files_of(place: str, store: Store) -> Any:
+    """Return the files that MLflow keeps at a place."""
+    store.check_place(place)
     from mlflow.store.artifact.artifact_repository_registry import get_artifact_repository
 
-    parts = urlsplit(place)
-    if parts.scheme in ("http", "https", "mlflow-artifacts") and parts.netloc not in (
-        "",
-        urlsplit(uri).netloc,
-    ):
-        raise StoreRefusedError(f"keeps the files on another server, {parts.netloc}")
-    return get_artifact_repository(place, tracking_uri=uri)
+    return get_artifact_repository(place, tracking_uri=store.uri)
 
 
 def _fetch_file(repository: Any, name: str, folder: Path, most_bytes: int) -> None:

@@ -13,7 +13,6 @@ from .metrics import BEST, METRICS
 from .store import open_client
 from .study_run import KIND
 
-_STORE_S = 300.0
 _ENDED = {"FINISHED": "finished", "FAILED": "failed", "KILLED": "killed", "RUNNING": "running"}
 
 
@@ -23,7 +22,7 @@ def rows_of_store(uri: str, runs_dir: Path) -> list[Row]:
     Raises:
         BadInput: the store does not answer.
     """
-    with open_client("runs", uri, runs_dir, _STORE_S) as client:
+    with open_client("runs", uri, runs_dir) as client:
         names = {experiment.experiment_id: experiment.name for experiment in pages(client.search_experiments)}
         runs = list(pages(client.search_runs, experiment_ids=list(names)))
     rows = [_of_store(run, names[run.info.experiment_id]) for run in runs if KIND not in run.data.tags]

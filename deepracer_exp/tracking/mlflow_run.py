@@ -14,14 +14,11 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 from mlflow import MlflowClient, __version__
 from mlflow.entities import Metric, Param, RunTag, ViewType
 from mlflow.exceptions import MlflowException
 from mlflow.utils.validation import MAX_METRICS_PER_BATCH, MAX_PARAMS_TAGS_PER_BATCH, MAX_TAG_VAL_LENGTH
-
-from deepracer_exp.addresses import without_passwords
 
 from .calls import StoreRefusedError, Value, pages, store_errors
 from .metadata import (
@@ -214,18 +211,9 @@ class MLflowRun:
         with store_errors():
             if not path.exists():
                 raise StoreRefusedError(f"{path} is gone")
-            if self._store.sqlite_file is not None:
-                self._refuse_far_files()
+            self._store.check_place(self._client.get_run(self.run_id).info.artifact_uri)
             copy = self._client.log_artifacts if path.is_dir() else self._client.log_artifact
             copy(self.run_id, str(path), folder)
-
-    def _refuse_far_files(self) -> None:
-        """Refuse a file store elsewhere: a database file of another person may name any, for any user."""
-        place = self._client.get_run(self.run_id).info.artifact_uri
-        if urlsplit(place).scheme not in ("", "file"):
-            raise StoreRefusedError(
-                f"its database file sends files to {without_passwords(place)}, another machine"
-            )
 
     def end(self, status: str, end_ms: int) -> None:
         """Write the status and the end of the run."""

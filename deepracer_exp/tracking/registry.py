@@ -29,7 +29,7 @@ from .calls import pages
 from .download import Download, download
 from .metadata import picture, race_result
 from .metrics import metric_names
-from .store import client_of, existing_store, has_store, open_client
+from .store import Store, client_of, existing_store, has_store, open_client
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -174,8 +174,9 @@ def promote(
         version = next((candidate for candidate in versions if candidate.tags.items() >= tags.items()), None)
         if version is None:
             metrics = _evaluated(run, folder)
+            store, experiment_id = existing_store(uri, runs_dir), recorded.experiment_id
             logged = _log_model(
-                client, recorded.experiment_id, run_id, run, folder, tags, features, seen, metrics
+                client, store, experiment_id, run_id, run, folder, tags, features, seen, metrics
             )
             shown = f"Checkpoint {int(folder.name)} of `{full_name(run)}`: {race_result(metrics)}.\n\n{picture(run_id)}"
             version = _version_of(client, logged.model_id, model, run_id, tags, shown)
@@ -194,6 +195,7 @@ def _evaluated(run: Path, checkpoint: Path) -> dict[str, float]:
 
 def _log_model(
     client: "MlflowClient",
+    store: Store,
     experiment_id: str,
     run_id: str,
     run: Path,
@@ -210,6 +212,7 @@ def _log_model(
 
     name = f"{run.name}-{checkpoint.name}"
     logged = client.create_logged_model(experiment_id, name, run_id, dict(tags), model_type="policy")
+    store.check_place(logged.artifact_location)
     observed = [
         TensorSpec(np.dtype(np.uint8 if key == "pixels" else np.float32), (-1, *shape), key)
         for key, shape in seen.items()

@@ -25,7 +25,6 @@ from .calls import (
     BoundedClient,
     StoreRefusedError,
     StoreUnavailableError,
-    ended_within,
     store_errors,
 )
 
@@ -91,6 +90,29 @@ class Store:
         return file.resolve() == self.sqlite_file.resolve() or (
             file.name == self.sqlite_file.name and not file.exists()
         )
+
+    def check_place(self, place: str) -> None:
+        """Refuse an address of files that the store names and that it could choose to harm its user.
+
+        A server has them itself: another one would be given this user's password, and a folder or a bucket be read or
+        written in the user's name. A database's are in a folder.
+
+        Raises:
+            StoreRefusedError: it is another kind of address.
+        """
+        parts, own = urlsplit(place), urlsplit(self.uri)
+        if self.is_server:
+            is_own = parts.scheme in ("http", "https", "mlflow-artifacts") and parts.netloc in (
+                "",
+                own.netloc,
+            )
+        else:
+            is_own = parts.scheme in ("", "file") and parts.netloc in ("", "localhost")
+        if not is_own:
+            raise StoreRefusedError(
+                f"keeps the files at {without_passwords(place)[:200]}; accepted: "
+                + ("on the server itself" if self.is_server else "a folder")
+            )
 
     @contextmanager
     def creation_lock(self) -> Iterator[None]:
@@ -208,9 +230,10 @@ def client_of(store: Store, total_s: float | None = None) -> "MlflowClient":
     def connect() -> MlflowClient:
         return MlflowClient(tracking_uri=store.uri, registry_uri=store.uri)
 
-    # A file answers, but its tables may have to be created first.
-    client = connect() if store.sqlite_file else ended_within(total_s or calls.CALL_S, connect)
-    return cast("MlflowClient", BoundedClient(client, total_s))
+    if store.sqlite_file is None:
+        return cast("MlflowClient", BoundedClient(connect, total_s))
+    client = connect()  # a file answers, but its tables may have to be created first
+    return cast("MlflowClient", BoundedClient(lambda: client, total_s))
 
 
 def is_run_id(text: str) -> bool:

@@ -3,7 +3,6 @@
 import ast
 import json
 import logging
-import os
 import shutil
 import time
 import traceback
@@ -46,6 +45,7 @@ from deepracer_exp.runs.fingerprint import refuse_changes
 from deepracer_exp.runs.folder import RunFolder
 from deepracer_exp.runs.lineage import Lineage, read_lineage
 from deepracer_exp.runs.result import FINISHED, INTERRUPTED, Ending
+from deepracer_exp.scratch import folder_aside
 from deepracer_exp.sim.batch import CarBatch
 from deepracer_exp.stopping.rules import UNDECIDED
 from deepracer_exp.tracking.loggers import open_tracker
@@ -133,11 +133,11 @@ def copy_run(run_dir: Path, attempt: int) -> Path:
     target = run_dir.with_name(f"{base}-attempt{attempt}")
     # Files and checkpoints are written under a name with a dot first.
     left_out = shutil.ignore_patterns(SUMMARY, ".*")
-    aside = target.with_name(f".{target.name}.{os.getpid()}")
-    shutil.copytree(run_dir, aside, symlinks=True, ignore=left_out)
-    if (aside / TRACKING).exists():
-        begin_again(aside / TRACKING, target)
-    aside.replace(target)
+    with folder_aside(target.parent, ".copy-") as aside:
+        shutil.copytree(run_dir, aside, symlinks=True, ignore=left_out, dirs_exist_ok=True)
+        if (aside / TRACKING).exists():
+            begin_again(aside / TRACKING, target)
+        aside.replace(target)
     return target
 
 

@@ -19,7 +19,7 @@ from deepracer_exp.tracking import download as module
 from deepracer_exp.tracking.calls import StoreRefusedError
 from deepracer_exp.tracking.download import Download, download
 from deepracer_exp.tracking.registry import look_up
-from deepracer_exp.tracking.store import resolve_store
+from deepracer_exp.tracking.store import Store, resolve_store
 from tests.conftest import refused
 
 
@@ -126,10 +126,41 @@ def test_a_registry_of_gigabytes_fills_no_disk(away, season, client, tmp_path):
     assert not list(away.parent.iterdir())
 
 
-@pytest.mark.parametrize("place", ["http://other:80/x", "mlflow-artifacts://other/x"])
-def test_files_on_another_server_are_refused(place):
-    with pytest.raises(StoreRefusedError, match="other"):
-        module._files_of(place, "http://127.0.0.1:5000")
+SERVER, FILE = Store("http://127.0.0.1:5000", None), Store("sqlite:////x/mlflow.db", None)
+
+
+@pytest.mark.parametrize(
+    ("store", "place"),
+    [
+        *(
+            (SERVER, f"{scheme}://other/x")
+            for scheme in ("http", "mlflow-artifacts", "ftp", "s3", "gs", "sftp")
+        ),
+        *((SERVER, place) for place in ("file:///etc", "/etc", "dbfs:/x", "http://127.0.0.1:5000@other/x")),
+        *((FILE, place) for place in ("s3://other/x", "http://other/x", "file://other/x")),
+    ],
+)
+def test_files_are_neither_read_from_nor_sent_to_where_a_store_must_not_have_them(store, place):
+    with pytest.raises(StoreRefusedError, match="keeps the files at "):
+        store.check_place(place)
+
+
+@pytest.mark.parametrize(
+    ("store", "place"),
+    [
+        *((SERVER, place) for place in ("mlflow-artifacts:/1/x", "http://127.0.0.1:5000/api/x")),
+        *((FILE, place) for place in ("file:///runs/x", "/runs/x")),
+    ],
+)
+def test_a_server_has_the_files_itself_and_a_database_has_them_in_a_folder(store, place):
+    store.check_place(place)
+
+
+def test_what_killed_downloads_have_left_is_removed_by_the_next_one(away, season, client):
+    left = away.parent / ".download-left"
+    left.mkdir(parents=True)
+    resolve("champion", season.runs_dir, None)
+    assert [path.name for path in away.parent.iterdir()] == [away.name]
 
 
 def test_a_name_from_the_registry_becomes_no_path_out_of_runs_dir(away, season, monkeypatch):
