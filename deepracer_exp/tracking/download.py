@@ -107,7 +107,7 @@ def _fetch(wanted: Download, folder: Path) -> None:
     store = Store(wanted.uri, None, os.environ.get("MLFLOW_TRACKING_USERNAME"))
     client = client_of(store)
     if wanted.with_run:
-        files = _files_of(client.get_run(wanted.run_id).info.artifact_uri, store)
+        files = store.files_at(client.get_run(wanted.run_id).info.artifact_uri)
         there = {file.path for file in files.list_artifacts()}
         if CONFIG not in there:
             raise StoreRefusedError(
@@ -117,21 +117,13 @@ def _fetch(wanted: Download, folder: Path) -> None:
             if name in there:  # an imported model has no metrics
                 _fetch_file(files, name, folder, wanted.most_bytes)
     model = client.get_logged_model(wanted.model_id)
-    files = _files_of(model.artifact_location, store)
+    files = store.files_at(model.artifact_location)
     _fetch_file(files, f"{_CHECKPOINT}/{HASHES}", folder, wanted.most_bytes)
     hashes = read_json(folder / _CHECKPOINT / HASHES, WRITTEN)
     for name in _checked_names(hashes):
         _fetch_file(files, f"{_CHECKPOINT}/{name}", folder, wanted.most_bytes)
     (folder / CHECKPOINTS).mkdir()
     (folder / _CHECKPOINT).replace(folder / CHECKPOINTS / wanted.checkpoint)
-
-
-def _files_of(place: str, store: Store) -> Any:
-    """Return the files that MLflow keeps at a place."""
-    store.check_place(place)
-    from mlflow.store.artifact.artifact_repository_registry import get_artifact_repository
-
-    return get_artifact_repository(place, tracking_uri=store.uri)
 
 
 def _fetch_file(repository: Any, name: str, folder: Path, most_bytes: int) -> None:

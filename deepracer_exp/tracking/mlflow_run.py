@@ -20,7 +20,7 @@ from mlflow.entities import Metric, Param, RunTag, ViewType
 from mlflow.exceptions import MlflowException
 from mlflow.utils.validation import MAX_METRICS_PER_BATCH, MAX_PARAMS_TAGS_PER_BATCH, MAX_TAG_VAL_LENGTH
 
-from .calls import StoreRefusedError, Value, pages, store_errors
+from .calls import CALL_S, StoreRefusedError, Value, ended_within, pages, store_errors
 from .metadata import (
     END_TAG,
     EXPERIMENT_TAGS,
@@ -211,9 +211,10 @@ class MLflowRun:
         with store_errors():
             if not path.exists():
                 raise StoreRefusedError(f"{path} is gone")
-            self._store.check_place(self._client.get_run(self.run_id).info.artifact_uri)
-            copy = self._client.log_artifacts if path.is_dir() else self._client.log_artifact
-            copy(self.run_id, str(path), folder)
+            # Not by the run's id: asked again, a server could name another place.
+            files = self._store.files_at(self._client.get_run(self.run_id).info.artifact_uri)
+            copy = files.log_artifacts if path.is_dir() else files.log_artifact
+            ended_within(CALL_S, lambda: copy(str(path), folder))
 
     def end(self, status: str, end_ms: int) -> None:
         """Write the status and the end of the run."""

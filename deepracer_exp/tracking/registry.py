@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +26,7 @@ from deepracer_exp.runs.files import (
     read_run_id,
 )
 
-from .calls import pages
+from .calls import CALL_S, ended_within, pages
 from .download import Download, download
 from .metadata import picture, race_result
 from .metrics import metric_names
@@ -212,7 +213,7 @@ def _log_model(
 
     name = f"{run.name}-{checkpoint.name}"
     logged = client.create_logged_model(experiment_id, name, run_id, dict(tags), model_type="policy")
-    store.check_place(logged.artifact_location)
+    files = store.files_at(logged.artifact_location)
     observed = [
         TensorSpec(np.dtype(np.uint8 if key == "pixels" else np.float32), (-1, *shape), key)
         for key, shape in seen.items()
@@ -233,8 +234,8 @@ def _log_model(
         for name in (BEST_LAP, REPORT):
             if (run / name).exists():
                 shutil.copy(run / name, aside)
-        client.log_model_artifacts(logged.model_id, aside)
-    client.log_model_artifacts(logged.model_id, str(checkpoint), "checkpoint")
+        ended_within(CALL_S, partial(files.log_artifacts, aside))
+    ended_within(CALL_S, partial(files.log_artifacts, str(checkpoint), "checkpoint"))
     for key, value in metrics.items():
         # Exactly the run's own point, so that its curve has no duplicate.
         points = [point for point in client.get_metric_history(run_id, key) if point.value == value]

@@ -30,6 +30,7 @@ from .calls import (
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
+    from mlflow.store.artifact.artifact_repo import ArtifactRepository
 
 # MLflow reads these at each call and offers no parameter. Its own 7 retries would hold the queue for
 # minutes after a server is back, and a request may hang for its whole 120 s: `StoreThread` retries instead.
@@ -91,14 +92,14 @@ class Store:
             file.name == self.sqlite_file.name and not file.exists()
         )
 
-    def check_place(self, place: str) -> None:
-        """Refuse an address of files that the store names and that it could choose to harm its user.
+    def files_at(self, place: str) -> "ArtifactRepository":
+        """Return the files that the store keeps at a place, which it names itself.
 
-        A server has them itself: another one would be given this user's password, and a folder or a bucket be read or
-        written in the user's name. A database's are in a folder.
+        A server must have them itself: it could name another one, to be given this user's password, or a folder or a
+        bucket, to be read or written in the user's name. Those of a database must be in a folder.
 
         Raises:
-            StoreRefusedError: it is another kind of address.
+            StoreRefusedError: they are elsewhere.
         """
         parts, own = urlsplit(place), urlsplit(self.uri)
         if self.is_server:
@@ -113,6 +114,9 @@ class Store:
                 f"keeps the files at {without_passwords(place)[:200]}; accepted: "
                 + ("on the server itself" if self.is_server else "a folder")
             )
+        from mlflow.store.artifact.artifact_repository_registry import get_artifact_repository
+
+        return get_artifact_repository(place, tracking_uri=self.uri)
 
     @contextmanager
     def creation_lock(self) -> Iterator[None]:

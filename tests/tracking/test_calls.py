@@ -77,9 +77,9 @@ def test_what_a_training_could_not_record_is_its_last_lines_and_is_sent_by_their
     *_, warning, command = ended.stderr.splitlines()
     assert warning.startswith(f"warning: MLflow ({uri}): ")
     assert ODD[answer] in warning
-    name = ended.folder.name
+    name = f"{ended.folder.parent.name}/{ended.folder.name}"
     *_, word, store = command.split(" ")
-    assert name.startswith(word)
+    assert word == f"runs/{name}"
     assert store == f"tracking.uri={uri}"
     # The server is mended, at another port here.
     sent = call("runs", "send", word, f"tracking.uri={server.uri}")

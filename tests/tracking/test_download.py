@@ -142,7 +142,7 @@ SERVER, FILE = Store("http://127.0.0.1:5000", None), Store("sqlite:////x/mlflow.
 )
 def test_files_are_neither_read_from_nor_sent_to_where_a_store_must_not_have_them(store, place):
     with pytest.raises(StoreRefusedError, match="keeps the files at "):
-        store.check_place(place)
+        store.files_at(place)
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def test_files_are_neither_read_from_nor_sent_to_where_a_store_must_not_have_the
     ],
 )
 def test_a_server_has_the_files_itself_and_a_database_has_them_in_a_folder(store, place):
-    store.check_place(place)
+    store.files_at(place)
 
 
 def test_what_killed_downloads_have_left_is_removed_by_the_next_one(away, season, client):

@@ -98,7 +98,7 @@ def test_a_model_becomes_a_run_and_nothing_of_it_is_run(call, tmp_path, networks
     ended = call("import", "sent", "--name", "mine", "tracking=off", "seed=3")
     assert ended.code == 0, ended.stderr
     assert not list(tmp_path.rglob("it_was_run"))
-    assert f"deepracer-exp clone {ended.folder.name}" in ended.stdout
+    assert f"deepracer-exp clone runs/{ended.folder.parent.name}/{ended.folder.name}" in ended.stdout
     assert "deepracer-exp analyze sent" in ended.stdout
     run = StoredRun(ended.folder)
     experiment = run.experiment
