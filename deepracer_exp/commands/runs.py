@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deepracer_exp.errors import BadInput, count
+from deepracer_exp.runs.files import full_name
 
 from .arguments import (
     STORES,
@@ -167,14 +168,14 @@ def _lineage(args: argparse.Namespace) -> int:
     courses = len({member.course for _, member, _ in fastest}) > 1
     for generation, member, result in fastest:
         course = [member.course] if courses else []
-        table.add_row(f"generation {generation}", *course, result.words(), member.name)
+        table.add_row(f"generation {generation}", *course, result.words(), full_name(member.path))
     with console.capture() as drawn:
         console.print(grow(root, Tree(_label(root, run, best))))
         if fastest:
             table.columns[-1].overflow = "fold"
             console.print("", table, sep="\n")
     # Rich fills lines up to the width.
-    print("\n".join(line.rstrip() for line in drawn.get().splitlines()))
+    console.file.write("".join(f"{line.rstrip()}\n" for line in drawn.get().splitlines()))
     return 0
 
 
@@ -185,7 +186,9 @@ def _label(member: "FamilyMember", run: Path, best: dict[int, str]) -> "Text":
     from deepracer_exp.analysis.comparison import value_text
 
     asked_for = member.path == run.resolve()
-    label = Text(member.name, style="bold reverse" if asked_for else "bold" if member.record else "dim")
+    label = Text(
+        full_name(member.path), style="bold reverse" if asked_for else "bold" if member.record else "dim"
+    )
     if asked_for:
         label.append("  <- this run", style="not reverse bold")
     if id(member) in best:

@@ -15,7 +15,7 @@ from deepracer_exp.env.action_space import build_action_space, describe_actions
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import read_json_as
 
-from .files import LINEAGE, REWARD, RunRecord, full_name, is_run, read_head
+from .files import LINEAGE, REWARD, RunRecord, is_run, read_head
 from .result import RunResult, read_result
 
 _NO_EFFECT = ("runs_dir", "debug", "report", "tracking")
@@ -104,7 +104,6 @@ class FamilyMember:
     """A run of the family."""
 
     name: str
-    """EXPERIMENT/FOLDER."""
     path: Path
     record: RunRecord | None
     """The run's files; None if its folder is gone."""
@@ -242,7 +241,7 @@ def _grow(
             differences = run_differences([record, child.record])
             child.changes = {key: (a, b) for key, (a, b) in differences.items() if key not in _IGNORED}
     result = None if record is None else read_result(root)
-    return FamilyMember(full_name(root), root, record, lineage, generation, result, below)
+    return FamilyMember(root.name, root, record, lineage, generation, result, below)
 
 
 def run_differences(records: Sequence[RunRecord]) -> dict[str, list[Any]]:

@@ -43,10 +43,15 @@ def test_the_best_of_each_generation_stands_at_the_end(clan, call):
     assert ended.code == 0, ended.stderr
     last = [" ".join(line.split()) for line in ended.stdout.splitlines()[-3:]]
     assert last == [
-        "generation 0 mean usual lap 11.00 s, usual completion 90.0% 1-root",
-        "generation 1 mean usual lap 9.50 s, usual completion 90.0% 2-child",
-        "generation 2 mean usual lap 10.00 s, usual completion 90.0% 4-grandchild",
+        "generation 0 mean usual lap 11.00 s, usual completion 90.0% season/1-root",
+        "generation 1 mean usual lap 9.50 s, usual completion 90.0% season/2-child",
+        "generation 2 mean usual lap 10.00 s, usual completion 90.0% season/4-grandchild",
     ]
+
+
+def test_the_tree_in_a_terminal_is_styled(clan, call, monkeypatch):
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    assert "\x1b[1mseason/1-root" in call("runs", "lineage", "4-grandchild").stdout
 
 
 def test_the_tree_in_a_pipe_says_what_a_terminal_shows_by_colour(clan, call):
@@ -72,7 +77,7 @@ def test_a_missing_parent_is_shown_as_missing(clan, call, gone, generation, run,
     shutil.rmtree(clan.runs_dir / "season" / gone)
     ended = call("runs", "lineage", run)
     lines = ended.stdout.splitlines()
-    assert lines[0] == gone
+    assert lines[0] == f"season/{gone}"
     assert f"generation {generation}, missing: its folder was removed" in lines[1]
     assert rows(ended.stdout, relative)
     assert not rows(ended.stdout, stranger)
