@@ -115,7 +115,7 @@ def test_the_command_prints_a_line_a_run_and_rule_and_their_means(make_run, call
     ended = call("stopping", "replay", NAME, "runs/default/another", "stopping.converged.patience=40,80")
     assert ended.code == 0, ended.stderr
     lines = ended.stdout.splitlines()
-    for name in (NAME, "another", "mean"):
+    for name in (f"default/{NAME}", "default/another", "mean"):
         assert sum(line.startswith(name) for line in lines) == 2
     assert sum("converged.patience=40" in line for line in lines) == 3
     assert "60%" in lines[-2]  # with a patience of 40 it ends after its warm-up, 81 of 200
