@@ -101,11 +101,11 @@ class Store:
         Raises:
             StoreRefusedError: they are elsewhere.
         """
-        parts, own = urlsplit(place), urlsplit(self.uri)
+        parts, server = urlsplit(place), urlsplit(self.uri).netloc
         if self.is_server:
             is_own = parts.scheme in ("http", "https", "mlflow-artifacts") and parts.netloc in (
                 "",
-                own.netloc,
+                server,
             )
         else:
             is_own = parts.scheme in ("", "file") and parts.netloc in ("", "localhost")
