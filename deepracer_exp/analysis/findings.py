@@ -175,9 +175,9 @@ def _submit(view: LogView) -> Finding:
             completed = {1: "its lap", 2: "both laps"}.get(episodes, f"all {episodes} laps")
         average = "" if complete == 1 else " on average"
         sentence = (
-            f"Submit {_checkpoint(first['checkpoint'], 'was saved after')} iteration {first['iteration'] - 1}: its "
-            f"evaluation completed {completed}, in {first['lap_time_mean_s']:.2f} s{average}. The evaluations of the "
-            "log decide: they race without exploring."
+            f"Submit {_checkpoint(view, first['checkpoint'])} iteration {first['iteration']}: its evaluation completed "
+            f"{completed}, in {first['lap_time_mean_s']:.2f} s{average}. The evaluations of the log decide: they race "
+            "without exploring."
         )
         values |= {"lap_time_s": float(first["lap_time_mean_s"])}
         time_of = "lap_time_mean_s"
@@ -185,26 +185,20 @@ def _submit(view: LogView) -> Finding:
         low, high = map(float, wilson(complete, episodes))
         whose = "their" if view.in_blocks else "its"
         sentence = (
-            f"Submit {_checkpoint(first['checkpoint'], 'drove')} {_iterations(view, first['iteration'])}: a quarter "
-            f"of {whose} exploring laps are below {first['lap_time_p25_s']:.2f} s, and {complete} of {whose} "
-            f"{episodes} episodes are complete laps ({_share(low)} to {_share(high)} with 95% confidence)."
+            f"Submit {_checkpoint(view, first['checkpoint'])} {_iterations(view, first['iteration'])}: a quarter of "
+            f"{whose} exploring laps are below {first['lap_time_p25_s']:.2f} s, and {complete} of {whose} {episodes} "
+            f"episodes are complete laps ({_share(low)} to {_share(high)} with 95% confidence)."
         )
         values |= {"p25_s": float(first["lap_time_p25_s"])}
         time_of = "lap_time_p25_s"
     others = [
-        f"{row['checkpoint'] or _unnamed(row)} ({row[time_of]:.2f} s, {row['lap_share']:.0%})"
+        f"{row['checkpoint'] or 'that of iteration ' + str(row['iteration'])} ({row[time_of]:.2f} s, "
+        f"{row['lap_share']:.0%})"
         for row in best.iloc[1:].to_dict("records")
     ]
     if others:
         sentence += f" After it: {' and '.join(others)}."
     return Finding("submit", sentence, values, thresholds)
-
-
-def _unnamed(candidate: Mapping[str, Any]) -> str:
-    """Return what to call a checkpoint whose name is not known."""
-    if candidate["evaluated"]:
-        return f"that after iteration {candidate['iteration'] - 1}"
-    return f"that of iteration {candidate['iteration']}"
 
 
 def _nothing_to_submit(view: LogView, thresholds: Mapping[str, float]) -> Finding:
@@ -233,13 +227,16 @@ def _iterations(view: LogView, last: int) -> str:
     return f"iteration {last}" if first == last else f"the last of iterations {first} to {last}"
 
 
-def _checkpoint(name: str, did: str) -> str:
-    if name:
-        return f"the checkpoint {name}, which {did}"
-    return (
-        "the checkpoint (its name is not logged, nor can it be counted, since steps before it are not recorded) that "
-        f"{did}"
-    )
+def _checkpoint(view: LogView, name: str) -> str:
+    if not name:
+        return (
+            "the checkpoint (its name is not logged, nor can it be counted, since steps before it are not recorded) "
+            "that drove"
+        )
+    if view.recording.checkpoints_counted:
+        return f"the checkpoint {name} (no file names it: this is the count, and that of a clone goes on), which drove"
+    cloned = ", the model that was cloned," if name.endswith("_Step-0") else ","
+    return f"the checkpoint {name}{cloned} which drove"
 
 
 def _chance(view: LogView, target_s: float | None) -> Finding | None:

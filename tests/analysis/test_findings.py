@@ -123,8 +123,8 @@ def test_without_enough_laps_the_fastest_of_the_complete_evaluations_is_to_be_su
     metrics = evaluated.reindex(columns=view.recording.metrics.columns)
     recording = replace(view.recording, metrics=metrics, checkpoints={4: "4_Step-38", 5: "5_Step-47"})
     assert of(prepare(recording), "submit").sentence.startswith(
-        "Submit the checkpoint 5_Step-47, which was saved after iteration 4: its evaluation completed both "
-        "laps, in 9.60 s on average."
+        "Submit the checkpoint 4_Step-38, which drove iteration 4: its evaluation completed both laps, in 9.60 s "
+        "on average."
     )
 
 
@@ -139,18 +139,18 @@ def evaluated(view: LogView, *laps: tuple[int, float, float, float]) -> LogView:
 def test_evaluations_decide_whatever_the_exploring_laps_were() -> None:
     laps = laps_of((0, 5, 2.0), (10, 0, 3.0), (6, 4, 2.0))
     assert laps.candidates["iteration"].tolist() == [1, 2]
-    first_two = evaluated(laps, (0, 100.0, 9.9, 0), (1, 100.0, 9.4, 0))
-    assert "After it: that after iteration 0 (9.90 s, 100%)." in of(first_two, "submit").sentence
+    first_two = evaluated(laps, (1, 100.0, 9.9, 0), (2, 100.0, 9.4, 0))
+    assert "After it: that of iteration 1 (9.90 s, 100%)." in of(first_two, "submit").sentence
     view = evaluated(laps, (0, 60.0, 9.0, 0), (1, 100.0, 9.4, 0), (1, 100.0, 9.6, 0), (2, 100.0, 8.0, 2))
-    # After iteration 1 both laps are complete; the faster one after iteration 2 was put back twice.
+    # Of iteration 1 both laps are complete; the faster one of iteration 2 was put back twice.
     found = of(view, "submit")
-    assert "that was saved after iteration 1: its evaluation completed both laps" in found.sentence
-    assert (found.values["iteration"], found.values["lap_time_s"]) == (2, pytest.approx(9.5))
-    assert view.candidates["iteration"].tolist() == [2]
+    assert "that drove iteration 1: its evaluation completed both laps" in found.sentence
+    assert (found.values["iteration"], found.values["lap_time_s"]) == (1, pytest.approx(9.5))
+    assert view.candidates["iteration"].tolist() == [1]
     stars = [
         one for one in layers(chart_of(view, "lap_time_percentile"), "points") if one.marker.symbol == "star"
     ]
-    assert [list(one.x) for one in stars] == [[2]]
+    assert [list(one.x) for one in stars] == [[1]]
     # Without a complete lap they cannot decide.
     assert evaluated(laps, (1, 90.0, 9.4, 0)).candidates["iteration"].tolist() == [1, 2]
 
@@ -162,6 +162,22 @@ def test_the_policy_that_a_training_began_with_is_none_of_its_results() -> None:
     assert sentence.startswith(
         "Nothing to submit yet: 10 of 12 complete laps are those of iteration 0, driven by the"
     )
+
+
+@pytest.mark.parametrize(
+    ("name", "iteration", "words"),
+    [
+        ("0_Step-0", 1, "the checkpoint 1_Step-38, which drove iteration 1"),
+        ("28_Step-0", 0, "the checkpoint 28_Step-0, the model that was cloned, which drove iteration 0"),
+    ],
+)
+def test_the_first_evaluation_is_that_of_the_model_that_was_cloned_or_of_an_untrained_network(
+    name: str, iteration: int, words: str
+) -> None:
+    view = evaluated(laps_of((0, 5, 2.0), (0, 5, 2.0)), (0, 100.0, 9.0, 0), (1, 100.0, 9.4, 0))
+    view = prepare(replace(view.recording, checkpoints={0: name, 1: "1_Step-38"}))
+    assert view.candidates["iteration"].iloc[0] == iteration
+    assert words in of(view, "submit").sentence
 
 
 def test_findings_name_one_checkpoint_and_never_ask_for_more_training_beside_overfitting() -> None:

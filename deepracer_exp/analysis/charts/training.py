@@ -28,7 +28,7 @@ def training_progress(view: LogView) -> Chart | None:
     converged = [] if iteration is None else [mark(iteration, "converged", FAINT)]
     progress = curve_layers(table, "completion_mean", BLUE, "mean of the episodes")
     for column, color, name in (
-        ("eval_completion", ORANGE, "evaluation after the update"),
+        ("eval_completion", ORANGE, "evaluation"),
         ("held_out_completion", VERMILION, "held-out conditions"),
     ):
         if table[column].notna().any():

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import IO, Any
 
 from deepracer_exp.aws.archives import READ_ERRORS, natural, reason_of
+from deepracer_exp.aws.models.archive import CHECKPOINTS, checkpoint_names
 from deepracer_exp.aws.models.hyperparameters import read_hyperparameters
 from deepracer_exp.aws.models.job_settings import race_values
 from deepracer_exp.aws.models.model_metadata import ModelMetadata, read_model_metadata
@@ -17,7 +18,7 @@ from deepracer_exp.files import SETTINGS_BYTES, read_yaml
 
 from . import sim_trace
 from .files import LOG, LogFile, LogFolder, Place, place_of
-from .recording import TRAINING, LogProblem
+from .recording import CHECKPOINT, TRAINING, LogProblem
 from .sim_trace import StepTables, read_trace_csv
 from .text_log import MARKER, TrainingLog, piece_of, read_training_logs
 
@@ -30,7 +31,7 @@ _PARAMS = re.compile(r"(training|evaluation)_params.*\.ya?ml")
 # Files that lie beside the logs of a model and hold no data of a recording.
 _BESIDE = re.compile(
     r".*\.(?:pb|ckpt.*|meta|index|data-.*|mp4|png|jpg|py|parquet|ya?ml|lock|ready|done|finished|pbtxt)|\..*|done|checkpoint"
-    r"|worker_\d+\..*\.csv|ip\.json|deepracer_checkpoints\.json|.*[cC]heckpoint.*\.json|.*(?:model|carfile).*\.tar\.gz"
+    r"|worker_\d+\..*\.csv|ip\.json|.*[cC]heckpoint.*\.json|.*(?:model|carfile).*\.tar\.gz"
 )
 _MOST_NAMED = 3
 _MOST_METRICS_BYTES = 2**26
@@ -61,6 +62,8 @@ class Parts:
     reward: list[tuple[LogFile, str]] = field(default_factory=list)
     races: dict[str, dict[str, str]] = field(default_factory=dict)
     """By kind of job, what its parameters say of boxes and bots (`job_settings.race_values`)."""
+    model_checkpoints: list[tuple[LogFile, dict[str, str]]] = field(default_factory=list)
+    """Names of the best and the last checkpoint in the folder of a model, by the keys of `checkpoint_names`."""
     worlds: dict[str, str] = field(default_factory=dict)
     """Course by kind of job, from the files that start it."""
     files: list[LogFile] = field(default_factory=list)
@@ -142,6 +145,10 @@ def _read(parts: Parts, file: LogFile, alone: bool) -> bool:
     if _HYPERPARAMETERS.fullmatch(name):
         _read_hyperparameters(parts, file, file.head(SETTINGS_BYTES + 1))
         return True
+    if name == CHECKPOINTS:
+        names = checkpoint_names(str(file.path), file.head(SETTINGS_BYTES))
+        parts.model_checkpoints.append((file, {key: _checkpoint(name) for key, name in names.items()}))
+        return True
     if name.endswith(".json") and not _BESIDE.fullmatch(name):
         with file.open() as stream:
             rows, refused = read_metrics_json(stream)
@@ -211,6 +218,18 @@ def _read_hyperparameters(parts: Parts, file: LogFile, raw: bytes) -> None:
         (file, {key: getattr(settings, key) for key in settings.set_keys if hasattr(settings, key)})
     )
     parts.refuse(file, [(None, f"hyperparameters: {reason}") for reason in refused])
+
+
+def _checkpoint(name: str) -> str:
+    """Return the name of a checkpoint without its ending, `25_Step-33002`.
+
+    Raises:
+        ValueError: it is no such name.
+    """
+    match = CHECKPOINT.match(name)
+    if match is None:
+        raise ValueError(f"{name!r} is no name of a checkpoint; accepted: 25_Step-33002.ckpt")
+    return match[0]
 
 
 def _world(data: object) -> str:

@@ -33,6 +33,7 @@ from .files import (
 from .joining import JoinedSteps, log_place, uppermost
 from .parts import Parts, read_parts
 from .recording import (
+    CHECKPOINT,
     METRICS_COLUMNS,
     TRAINING,
     UPDATE_COLUMNS,
@@ -75,19 +76,28 @@ def read_recording(path: Path) -> Recording:
     return recording
 
 
-def _counted_checkpoints(steps: pd.DataFrame) -> dict[int, str]:
-    """Return the names of the checkpoints before each iteration and after the last, if every step before is recorded.
-
-    The service names a checkpoint by its number and the control steps before it.
-    """
+def _steps_before(steps: pd.DataFrame) -> list[int]:
+    """Return the control steps of a training before each iteration and after the last, while all are recorded."""
     episodes = steps.groupby("episode").agg(
         iteration=("iteration", "last"), rows=("steps", "size"), last=("steps", "max")
     )
     episodes["whole"] = (episodes["rows"] == episodes["last"]) & (episodes.index == np.arange(len(episodes)))
     iterations = episodes.groupby("iteration").agg({"rows": "sum", "whole": "all"})
     whole = (iterations["whole"] & (iterations.index == np.arange(len(iterations)))).cummin()
-    before = [0, *iterations["rows"].cumsum()[whole]] if 0 in iterations.index else []
-    return {number: f"{number}_Step-{count}" for number, count in enumerate(before)}
+    return [0, *iterations["rows"].cumsum()[whole]] if 0 in iterations.index else []
+
+
+def _counted_checkpoints(before: Sequence[int], last: str) -> dict[int, str]:
+    """Return the names of the checkpoints that drove iterations, by the control steps `before` each.
+
+    The service numbers checkpoints, and a clone's continue those of its parent: `last` is the name of the last one in
+    the model's folder, "" if there is none. Without that step among those counted, the count is not the model's.
+    """
+    base, match = 0, CHECKPOINT.match(last)
+    if match is not None:
+        number, driven = map(int, match.groups())
+        base = number - before.index(driven) if driven in before else -1
+    return {} if base < 0 else {k: f"{base + k}_Step-{driven}" for k, driven in enumerate(before)}
 
 
 class _Assembly:
@@ -116,9 +126,15 @@ class _Assembly:
             Round("/".join(root), first[number]) for number, root in enumerate(self.rounds) if number in first
         ]
         steps = steps_of([*rows, *self._evaluation_rows()])
+        stored = uppermost(parts.model_checkpoints) or {}
         named = self._checkpoints(first)
-        counted = _counted_checkpoints(steps[steps["stream"] == TRAINING])
-        if len(rounds) > 1 or any(counted.get(key, text) != text for key, text in named.items()):
+        counted = {}
+        if len(rounds) <= 1:
+            counted = _counted_checkpoints(
+                _steps_before(steps[steps["stream"] == TRAINING]),
+                "" if named else stored.get("last_checkpoint", ""),
+            )
+        if any(counted.get(key, text) != text for key, text in named.items()):
             counted = {}
         return Recording(
             name=name,
@@ -132,6 +148,8 @@ class _Assembly:
             problems=tuple(self.problems),
             files=tuple(file.path for file in parts.files),
             checkpoints=dict(sorted((counted | named).items())),
+            checkpoints_counted=bool(counted) and not named and not stored,
+            model_checkpoints=stored,
             rounds=tuple(rounds) if len(rounds) > 1 else (),
             race=parts.races.get(TRAINING) or next(iter(parts.races.values()), {}),
         )

@@ -1,5 +1,6 @@
 """A recording of a training or a race in one schema, whichever program wrote it."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,6 +10,8 @@ import pandas as pd
 
 from deepracer_exp.aws.models.model_metadata import ModelMetadata
 
+CHECKPOINT = re.compile(r"(\d{1,9})_Step-(\d{1,12})(?!\d)")
+"""The service's name of a checkpoint: its number, and the control steps of the training before it."""
 TRAINING = "training"
 """Name of the stream, and kind of job, of a training's episodes."""
 STEP_COLUMNS: Mapping[str, tuple[str, str]] = {
@@ -136,6 +139,11 @@ class Recording:
     checkpoints: Mapping[int, str] = field(default_factory=dict)
     """Name of the service's checkpoint that drove each iteration, from its text logs or, if every step before it is
     recorded, their number: `309_Step-8349`."""
+    checkpoints_counted: bool = False
+    """Whether nothing but the count gives these names: the numbers of a clone continue those of its parent."""
+    model_checkpoints: Mapping[str, str] = field(default_factory=dict)
+    """Names of the checkpoints in the model's folder: `best_checkpoint` by the service's own evaluations, and
+    `last_checkpoint`."""
     rounds: tuple[Round, ...] = ()
     """The trainings in the order of `steps`; empty where there is only one."""
     race: Mapping[str, str] = field(default_factory=dict)

@@ -95,8 +95,14 @@ def _episode_line(episode: Any, driven: int, reward: float) -> str:
 
 
 def metrics_text(numbered: NumberedTraining, evaluated: pd.DataFrame) -> str:
-    """Return the metrics file: an item for each episode, and for each evaluation."""
-    tried = {int(row["iteration"]) - numbered.first_iteration: row for row in evaluated.to_dict("records")}
+    """Return the metrics file: an item for each episode, and for each evaluation.
+
+    The service evaluates after an iteration the policy that drove it: ours, evaluated after its update, stands after
+    the next iteration, and that of the last one is left out.
+    """
+    tried = {
+        int(row["iteration"]) - numbered.first_iteration + 1: row for row in evaluated.to_dict("records")
+    }
     items: list[dict[str, Any]] = []
     for iteration, episodes in numbered.episodes.groupby("iteration", sort=False):
         end_s = 0.0

@@ -127,6 +127,19 @@ def read_model(path: str, checkpoint: str) -> StoredModel:
         raise BadInput(path, f"cannot be read: {reason}", _ACCEPTED) from error
 
 
+def checkpoint_names(path: str, raw: bytes) -> dict[str, str]:
+    """Return the names in `deepracer_checkpoints.json`, by the keys `best_checkpoint` and `last_checkpoint`.
+
+    Raises:
+        BadInput: it does not have them.
+    """
+    try:
+        return {kind: value["name"] for kind, value in json.loads(raw).items() if value["name"]}
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        accepted = "the names of best_checkpoint and last_checkpoint"
+        raise BadInput(path, f"{error!r}", accepted) from error
+
+
 def _read(files: _Files, checkpoint: str) -> StoredModel:
     weights = [name for name in files.sizes if name.endswith((INDEX, ".pb"))]  # as in `commands.files`
     whole = [
@@ -176,14 +189,7 @@ def _choose(files: _Files, weights: list[str], checkpoint: str) -> tuple[str, st
     listed: Any = {}
     if beside(CHECKPOINTS) in files.sizes:
         raw = files.read(beside(CHECKPOINTS), SETTINGS_BYTES)
-        try:
-            listed = {kind: value["name"] for kind, value in json.loads(raw).items() if value["name"]}
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
-            raise BadInput(
-                f"{files.path}/{beside(CHECKPOINTS)}",
-                f"{error!r}",
-                "the names of best_checkpoint and last_checkpoint",
-            ) from error
+        listed = checkpoint_names(f"{files.path}/{beside(CHECKPOINTS)}", raw)
     newest = (
         files.read(beside(NEWEST), SETTINGS_BYTES).decode("utf-8", "replace")
         if beside(NEWEST) in files.sizes
