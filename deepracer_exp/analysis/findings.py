@@ -19,6 +19,7 @@ from .others import costliest
 from .sectors import Sector, sector_at, sectors_now, sectors_of
 from .slower_laps import CHANCE, LEAST_TIMES, SLOWER, slower_laps
 from .statistics import wilson
+from .step_columns import begins_of, first_rows
 from .tables import CANDIDATE_LAPS, DENSE
 from .zigzag import CURE, ZIGZAG_DEG, ZIGZAG_PER_M, zigzag_in_words, zigzag_now
 
@@ -332,7 +333,7 @@ def _crashes(view: LogView) -> Finding | None:
     """Say in how many finished episodes of the whole log the car crashed, and how often at one object."""
     episodes = view.episodes.loc[view.episodes["ended"], "episode"]
     crashed_now = (view.steps["episode_status"] == "crashed").to_numpy()
-    rows = view.steps[crashed_now & ~np.append([False], crashed_now[:-1])]
+    rows = view.steps[begins_of(crashed_now, first_rows(view.steps))]
     rows = rows[rows["episode"].isin(episodes)].dropna(subset=["X", "Y"])
     if not len(rows):
         return None

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from .racing_line import WHEELBASE_M
 from .statistics import Values, wilson
-from .step_columns import first_rows
+from .step_columns import begins_of, first_rows
 
 Rows = NDArray[np.intp]
 PLACE_M = 1.5
@@ -74,9 +74,7 @@ def off_track_rows(steps: pd.DataFrame) -> Rows:
     if not len(steps):
         return np.zeros(0, np.intp)
     status, first = steps["episode_status"], first_rows(steps)
-    is_off = (status == "off_track").to_numpy()
-    off = is_off.copy()
-    off[1:] &= first[1:] | ~is_off[:-1]
+    off = begins_of((status == "off_track").to_numpy(), first)
     ended = (
         (status == "").to_numpy()
         & steps["done"].to_numpy(bool)

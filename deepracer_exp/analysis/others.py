@@ -21,6 +21,7 @@ from deepracer_exp.sim.collisions import BOX_M, CAR_M, first_hit
 from deepracer_exp.tracks.track import Track
 
 from .statistics import Values, wilson
+from .step_columns import begins_of
 
 ORIGIN_BEHIND_M = 0.14
 """Distance from the logged point, the front of the car, back to its origin (deepracer-simapp)."""
@@ -159,7 +160,7 @@ def _met(
     yaw_rad = np.radians(yaw_rad)
     status = steps["episode_status"].astype(str).to_numpy()
     begins = np.append(True, np.diff(of_episode) != 0)
-    crashed = np.flatnonzero((status == "crashed") & (begins | (np.append([""], status[:-1]) != "crashed")))
+    crashed = np.flatnonzero(begins_of(status == "crashed", begins))
     # A crash is judged by where the bots were a step before, and by where a rival is.
     lagged = poses[np.where(begins[crashed], crashed, crashed - 1)]
     if race.rivals is not None:

@@ -235,12 +235,18 @@ def whole_from_start(steps: pd.DataFrame) -> NDArray[np.bool_]:
     return (steps["steps"].to_numpy()[begin] <= FIRST_STEPS) | flying_rows(steps)[begin]
 
 
+def begins_of(is_so: NDArray[np.bool_], first: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which rows are the first of those in a row that are so; an episode's `first` row follows no other."""
+    begins = is_so.copy()
+    begins[1:] &= first[1:] | ~is_so[:-1]
+    return begins
+
+
 def resets(steps: pd.DataFrame) -> NDArray[np.int64]:
     """Return for each episode how often the car was put back on its way."""
     first = first_rows(steps)
     stopped = steps["episode_status"].isin(STOPPED).to_numpy()
-    begins = stopped.copy()
-    begins[1:] &= first[1:] | ~stopped[:-1]
+    begins = begins_of(stopped, first)
     begin = np.flatnonzero(first)
     end = np.append(begin[1:], len(steps))[: len(begin)] - 1
     return (

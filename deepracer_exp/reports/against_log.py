@@ -18,7 +18,7 @@ from deepracer_exp.analysis.log_tables import NONE, Table, facts, problem_rows
 from deepracer_exp.analysis.log_view import DISCOUNT, PREPARE, LogView
 from deepracer_exp.analysis.sectors import interval_times, sector_at, sectors_of
 from deepracer_exp.analysis.statistics import Values, totals
-from deepracer_exp.analysis.step_columns import add_derived, first_rows
+from deepracer_exp.analysis.step_columns import add_derived, begins_of, first_rows
 from deepracer_exp.analysis.tables import episode_table
 from deepracer_exp.aws.logs.recording import STEP_COLUMNS
 from deepracer_exp.errors import BadInput, count
@@ -100,7 +100,7 @@ class Laps:
         complete = int((laps["complete"] & (laps["resets"] == 0)).sum())
         status = self.steps["episode_status"].astype(str)
         mistake = status.isin(_MISTAKES).to_numpy()
-        began = mistake & ~np.r_[False, mistake[:-1]]
+        began = begins_of(mistake, first_rows(self.steps))
         turned_deg = rows["steer"].diff().abs()[np.diff(self.number[rows.index], prepend=-1) == 0]
         return {
             "complete laps, %": np.nan if self.chosen else 100.0 * complete / tried,
@@ -143,7 +143,7 @@ def logged_laps(view: LogView, course: Track) -> Laps:
     words = count(int(laps["lap_time_s"].notna().sum()), "complete lap")
     words = f"the fastest {len(best)} of {words}" if words != count(len(best), "complete lap") else words
     chosen = np.isin(view.episode_index, best)
-    words += f" of the training, which explores: the log has no evaluation{_company(view)}"
+    words += f" of the training, which explores: the log has no steps of an evaluation{_company(view)}"
     return laps_on(course, view.steps[chosen], words, chosen=True)
 
 

@@ -1,6 +1,7 @@
 """Rules of the findings on made-up logs whose answers are known."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -14,7 +15,9 @@ from deepracer_exp.analysis.log_tables import NONE, best_laps, headline, iterati
 from deepracer_exp.analysis.log_view import LEAST_EPISODES, LogView, prepare
 from deepracer_exp.analysis.off_track import neighbours
 from deepracer_exp.analysis.sectors import sectors_of
+from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.reports.against_log import laps_on
 from deepracer_exp.reports.log_report import LogPage, draw_sections, html
 from deepracer_exp.runs.recording import RunRecording
 from deepracer_exp.runs.result import RunResult
@@ -375,6 +378,12 @@ def test_crashes_at_one_object_are_a_finding_with_place_and_count() -> None:
 
 
 FALLING = [10.0 * k for k in range(10)] + [90.0] * 9 + [40.0] * 10
+
+
+def test_a_crash_in_the_first_step_after_a_crash_is_another(reference: Path) -> None:
+    view = prepare(read_recording(reference / "inputs/fourth/03-crash-in-first-step"))
+    assert of(view, "crashes").sentence.startswith("The car crashed in 4 of 5 episodes")
+    assert laps_on(view.course, view.steps, "").measures()["off the track or stuck, per lap"] == 1.0
 
 
 @pytest.mark.parametrize(
