@@ -11,6 +11,7 @@ import shapely
 from numpy.typing import NDArray
 
 from deepracer_exp.aws.logs.recording import LogProblem, Recording
+from deepracer_exp.aws.logs.sim_trace import EARLIEST_CLOCK_S
 from deepracer_exp.aws.worlds.catalogue import find_world, worlds
 from deepracer_exp.aws.worlds.routes import NEAR_M, recognise, world_rows
 from deepracer_exp.config.car import CarConfig
@@ -69,7 +70,7 @@ def find_courses(recording: Recording) -> tuple[dict[str, Track], tuple[LogProbl
     names = steps["track"].astype("category").cat.remove_unused_categories()
     for code, name in enumerate(map(str, names.cat.categories)):
         rows = np.flatnonzero(names.cat.codes == code)
-        sample = steps.iloc[rows[:: max(1, len(rows) // _SAMPLE)]]
+        sample = _with_late_wheels(steps, rows[:: max(1, len(rows) // _SAMPLE)])
         logged = name or recording.track or ""
         try:
             if logged in configs:
@@ -147,9 +148,24 @@ def _recognised(logged: str, sample: pd.DataFrame) -> _Recognised | None:
 
 
 def _misjudged(track: Track, sample: pd.DataFrame, car: CarConfig) -> float:
-    """Return the share of rows whose `all_wheels_on_track` is not what a course's borders say."""
-    on_road = recorded_wheels_on_road(Tracks([track]), np.zeros(1, np.intp), sample, car)
-    return float(np.mean(on_road.all(axis=1) != sample["all_wheels_on_track"].to_numpy(bool)))
+    """Return the share of rows whose `all_wheels_on_track`, in time or late, is not what a course's borders say."""
+    on_road = recorded_wheels_on_road(Tracks([track]), np.zeros(1, np.intp), sample, car).all(axis=1)
+    logged = sample[["all_wheels_on_track", "late_wheels"]].to_numpy(bool)
+    return float(np.mean(on_road[:, None] != logged, axis=0).min())
+
+
+def _with_late_wheels(steps: pd.DataFrame, rows: NDArray[np.intp]) -> pd.DataFrame:
+    """Return rows of the steps with `late_wheels`: where the simulator ran on, what the next row of the episode logs.
+
+    The service's simulator of 2019 and 2020 was not paused between control steps, and wheels are logged a step late.
+    Its time stamps are those of a clock.
+    """
+    sample = steps.iloc[rows]
+    following = steps.iloc[np.minimum(rows + 1, len(steps) - 1)]
+    wheels, late = (some["all_wheels_on_track"].to_numpy(bool) for some in (sample, following))
+    follows = sample["episode"].to_numpy() == following["episode"].to_numpy()
+    follows &= sample["tstamp"].to_numpy() >= EARLIEST_CLOCK_S
+    return sample.assign(late_wheels=np.where(follows, late, wheels))
 
 
 def recorded_wheels_on_road(

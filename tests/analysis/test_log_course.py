@@ -103,6 +103,17 @@ def test_a_recording_of_the_service_has_the_borders_of_its_world(
     assert (tracks[""].name, problems) == (world, ())
 
 
+def test_wheels_that_are_logged_a_step_late_say_nothing_of_the_width(reference: Path) -> None:
+    log = reference / "inputs/fourth/04-late-wheels/made-up-robomaker.log"
+    recording = read_recording(log)
+    tracks, problems = find_courses(recording)
+    assert (tracks["reinvent_base"].name, problems) == ("reinvent_base_2019", ())
+    # By the clock of a simulation, which was paused, it would be another width.
+    paused = recording.steps.assign(tstamp=recording.steps["tstamp"] - recording.steps["tstamp"].min())
+    (problem,) = find_courses(replace(recording, steps=paused))[1]
+    assert "its width may be another" in problem.reason
+
+
 def test_a_course_driven_against_its_waypoints_is_turned_around() -> None:
     recording = made_up_recording([Drive()])
     steps = recording.steps

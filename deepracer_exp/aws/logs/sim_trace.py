@@ -34,7 +34,8 @@ LOG_LAYOUTS: Layouts = {
     18: (*COMMON, "episode_status", "pause_duration", _COUNTER_OR_CLOCK),
     19: (*COMMON, *LATER),
 }
-_EARLIEST_CLOCK_S = 1e8
+EARLIEST_CLOCK_S = 1e8
+"""Time stamps from which on they are unix time, not that of a simulation."""
 # Figures and tables have a place for every waypoint and action up to the highest.
 _WHOLE = {"episode": 2**31 - 1, "steps": 2**31 - 1, "closest_waypoint": 99_999}
 """Columns of whole numbers and their largest values."""
@@ -308,7 +309,7 @@ class _Rows:
             numbers, unreadable = _numbers(texts)
             self._refuse(name, texts, unreadable, "a number")
             if name == _COUNTER_OR_CLOCK:
-                clock = numbers >= _EARLIEST_CLOCK_S
+                clock = numbers >= EARLIEST_CLOCK_S
                 self._add_numbers("obstacle_crash_counter", texts, np.where(clock, math.nan, numbers))
                 self._add_numbers("wall_clock", texts, np.where(clock, numbers, math.nan))
             elif name == "action":
