@@ -24,8 +24,6 @@ SUFFIXES = (".csv", ".npy", ".py")
 """Endings of the formats, which `write_line` describes."""
 DIGITS = 4
 """Decimals that are written: 0.1 mm, as in logs of the service."""
-_SMOOTHED = 3
-"""Control steps in the mean of the driven speed of a log: the service's steps are uneven."""
 _OFFERED = 5
 """Laps that a message offers."""
 
@@ -66,8 +64,8 @@ def _lap(view: "LogView", laps: "pd.DataFrame", episode: int) -> "pd.Series[floa
 
 
 def driven_speed_mps(track_speed_mps: "pd.Series[float]") -> "pd.Series[float]":
-    """Return the mean speed around each control step of an episode from that of single steps, `track_speed_mps`."""
-    return track_speed_mps.rolling(_SMOOTHED, center=True, min_periods=1).mean().bfill().ffill()
+    """Return the speed of an episode's control steps, of its first row that of the next one."""
+    return track_speed_mps.bfill().ffill()
 
 
 def racing_line_table(track: "Track") -> "pd.DataFrame":

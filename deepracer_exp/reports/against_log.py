@@ -35,7 +35,7 @@ MOST_TRAINING_LAPS = 10
 """Laps of a training that stand for a log without an evaluation: its policy still explores."""
 _MISTAKES = ("off_track", "crashed", "reversed", "immobilized")
 _SMOOTHED = 5
-"""Control steps in the mean of speed and steering along a lap: the service's steps are uneven."""
+"""Control steps in the mean of steering and place along a lap; the speed is one of as many already."""
 _NEAR = 0.03
 """Share of the lap beyond which the nearest step says nothing about a place."""
 _SAME_ACTION = 0.02
@@ -74,10 +74,11 @@ class Laps:
         return self.steps[(self.steps["episode_status"] != PREPARE).to_numpy()]
 
     def along(self, column: str, closed: bool) -> Values:
-        """Return the mean of a column over `_SMOOTHED` steps at `PLACES`, (laps, places); NaN where no lap passed."""
+        """Return a column at `PLACES`, (laps, places), as a mean over steps; NaN where no lap passed."""
+        steps = 1 if column == "track_speed_mps" else _SMOOTHED
         table = np.full((len(self.episodes), len(PLACES)), np.nan)
         for lap, rows in self.steps.groupby(self.number):
-            values = rows[column].rolling(_SMOOTHED, center=True, min_periods=1).mean().to_numpy(np.float64)
+            values = rows[column].rolling(steps, center=True, min_periods=1).mean().to_numpy(np.float64)
             finite = np.isfinite(values)
             if not finite.any():
                 continue

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -10,6 +11,7 @@ import pytest
 from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.step_columns import DERIVED_COLUMNS
 from deepracer_exp.analysis.tables import EPISODE_COLUMNS, ITERATION_COLUMNS
+from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.aws.logs.recording import STEP_COLUMNS
 
 from .made_up import Drive, made_up_course, made_up_recording
@@ -91,6 +93,22 @@ def test_speeding_up_is_acceleration_and_slowing_down_is_braking() -> None:
     assert steps.loc[place.between(0.39, 0.42), "acceleration_mps2"].max() > 5.0
     assert steps.loc[place.between(0.59, 0.63), "braking_mps2"].max() > 5.0
     assert steps.loc[place.between(0.39, 0.42), "braking_mps2"].max() < 0.5
+
+
+def test_time_stamps_that_jitter_do_not_make_a_car_fast() -> None:
+    recording = made_up_recording([Drive(speed_mps=2.0)])
+    late_s = np.random.default_rng(0).uniform(-0.022, 0.022, len(recording.steps))
+    jittered = recording.steps.assign(tstamp=recording.steps["tstamp"] + late_s)
+    view = prepare(replace(recording, steps=jittered))
+    single = (view.steps["delta_dist_m"] / view.steps["delta_time_s"]).iloc[3:-3]
+    assert single.max() > 2.0 * 1.7
+    assert view.steps["track_speed_mps"].iloc[3:-3].between(2.0 * 0.85, 2.0 * 1.2).all()
+
+
+@pytest.mark.parametrize("name", ["console_v5_v2", "droa_v6_alternating", "droa_v6_fast"])
+def test_no_speed_is_far_above_the_fastest_command(reference: Path, name: str) -> None:
+    steps = prepare(read_recording(reference / "race_pace" / f"{name}.tar.gz")).steps
+    assert steps["track_speed_mps"].max() <= steps["throttle"].max()
 
 
 def test_a_tail_that_comes_round_slides_to_its_side_and_rolling_wheels_do_not() -> None:

@@ -9,6 +9,7 @@ from deepracer_exp.analysis.log_view import STARTING_STEPS, LogView, closest_way
 from deepracer_exp.analysis.racing_line import center_line, minimum_curvature_line
 from deepracer_exp.analysis.sectors import sectors_now, sectors_of
 from deepracer_exp.analysis.statistics import MOST_ROWS, Values, means, quantiles, subsample
+from deepracer_exp.analysis.step_columns import SPEED_STEPS
 from deepracer_exp.analysis.zigzag import CENTRED_DEG, zigzag_in_words, zigzag_now
 from deepracer_exp.errors import count
 
@@ -55,7 +56,8 @@ def lap_line(view: LogView) -> Chart | None:
     return Chart(
         name="lap_line",
         title=f"The fastest {kind}: {row['lap_time_s']:.3f} s, {whose}, episode {row['episode']}",
-        caption="One dot for each control step of the fastest complete lap, coloured by the speed of the car; "
+        caption="One dot for each control step of the fastest complete lap, coloured by the speed of the car "
+        f"over {SPEED_STEPS} control steps, whose time stamps jitter; "
         f"at a constant {mean_mps:.2f} m/s the centre line would take as long. Dots close together are slow: find "
         "where the car slows down and ask whether the bend requires it."
         + " The outlines are the boxes of this episode."
@@ -120,10 +122,8 @@ def speed_steering_by_waypoint(view: LogView) -> Chart | None:
             layers.append(line(x, means(waypoint, rows["throttle"], n), PALE, "mean speed commanded"))
         if lap is not None:
             driven = lap[lap["steps"] > STARTING_STEPS]
-            # Control steps of uneven length make the speed of a single one jump.
-            smooth = driven[column].rolling(3, center=True, min_periods=1).mean()
-            best = _without_gaps(means(closest_waypoints(driven), smooth, n))
-            layers.append(line(x, best, INK, "fastest lap, mean of three steps", width=1.5))
+            best = _without_gaps(means(closest_waypoints(driven), driven[column], n))
+            layers.append(line(x, best, INK, "fastest lap", width=1.5))
     if view.course is not None:
         places = waypoint_positions(view.course)
         grip_mps2, top_mps = _grip(rows.iloc[part]), float(rows["throttle"].max())

@@ -43,7 +43,7 @@ _OF_STEPS = (
 )
 """Columns of the steps that `LAP_COLUMNS` are computed from."""
 _SMOOTHED = 5
-"""Control steps in the mean of speed and steering along a lap."""
+"""Control steps in the mean of the steering along a lap; the speed is one of as many (`step_columns.SPEED_STEPS`)."""
 _ENOUGH = 20
 """Laps of the last third of the iterations from which on they have a histogram of their own."""
 _FITTED = 8
@@ -166,7 +166,7 @@ def lap_delta(view: LogView) -> Chart | None:
     drives = {"ordinary": (ordinary, ORANGE), "fastest": (fastest, BLUE)}
     driven = {name: _along(view, lap) for name, (lap, _) in drives.items()}
     for column, title, label in (
-        ("track_speed_mps", f"Speed along the track, mean of {_SMOOTHED} steps", "m/s"),
+        ("track_speed_mps", "Speed along the track", "m/s"),
         ("steer", f"Steering angle, positive to the left, mean of {_SMOOTHED} steps", "degrees"),
         ("offset_m", "Distance from the centre line, positive to the left", "m"),
     ):
@@ -216,8 +216,7 @@ def _along(view: LogView, lap: int) -> pd.DataFrame:
     """Return the rows of a lap from the start line on, with a gap where the lap began and ended."""
     steps = view.steps[["lap_position", "track_speed_mps", "steer", "offset_m"]]
     rows = steps.iloc[view.rows_of(view.episodes.index == lap)].reset_index(drop=True)
-    for column in ("track_speed_mps", "steer"):
-        rows[column] = rows[column].rolling(_SMOOTHED, center=True, min_periods=1).mean()
+    rows["steer"] = rows["steer"].rolling(_SMOOTHED, center=True, min_periods=1).mean()
     first = int(rows["lap_position"].to_numpy().argmin())
     return pd.concat([rows.iloc[first:], rows.iloc[:0].reindex([0]), rows.iloc[:first]], ignore_index=True)
 
