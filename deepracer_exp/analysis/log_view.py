@@ -36,6 +36,9 @@ LEAST_LAPS = 5
 """Complete laps in the last third of the iterations below which those of the whole log show how the car drives."""
 LEAST_EPISODES = 5
 """Episodes without which an iteration says little: SAC updates its policy after each one."""
+FINISHED = 0.75
+"""Share of the usual number of episodes below which the job ended in the last iteration: its few starting places make
+it easier or harder than the others."""
 STARTING_STEPS = 10
 """First control steps of an episode, in which the car pulls away from standing."""
 
@@ -61,7 +64,10 @@ class LogView:
     iterations: pd.DataFrame
     """Their iterations, `tables.ITERATION_COLUMNS`."""
     judged: pd.DataFrame
-    """Rows that judge a training: its iterations, or blocks of them where they have fewer than `LEAST_EPISODES`."""
+    """Rows that judge a training: its iterations, or blocks of them where they have fewer than `LEAST_EPISODES`; of a
+    log without the one in which the job ended."""
+    in_blocks: bool
+    """Whether several iterations are judged together."""
     evaluation_episodes: pd.DataFrame
     """Episodes on the course of all other streams, with `stream`."""
     evaluation_steps: pd.DataFrame
@@ -138,11 +144,6 @@ class LogView:
     def traced(self) -> str:
         """Return the words after a number of episodes that are counted in the traces."""
         return " with a trace" if self.untraced else ""
-
-    @property
-    def in_blocks(self) -> bool:
-        """Whether several iterations are judged together."""
-        return len(self.judged) < len(self.iterations)
 
     @cached_property
     def candidates(self) -> pd.DataFrame:
@@ -302,8 +303,11 @@ def prepare(log: Recording | RunRecording | EvaluationRecording, track: str | No
         counted = run.counted.set_index("iteration").reindex(iterations["iteration"])
         iterations = judged = iterations.assign(**{name: counted[name].to_numpy() for name in counted})
     usual = iterations["episodes"][iterations["episodes"] > 0].median()
-    if run is None and usual < LEAST_EPISODES:
+    in_blocks = run is None and usual < LEAST_EPISODES
+    if in_blocks:
         judged = iteration_table(recording, trained, episodes, LEAST_EPISODES)
+    elif run is None and len(iterations) > 1 and 0 < iterations["episodes"].iloc[-1] < FINISHED * usual:
+        judged = iterations.iloc[:-1]
     if not (here & training).any():
         trained = driven.assign(episode=np.cumsum(first_rows(driven)) - 1)
         episodes = raced.assign(episode=np.arange(len(raced)))
@@ -318,6 +322,7 @@ def prepare(log: Recording | RunRecording | EvaluationRecording, track: str | No
         episodes=episodes,
         iterations=iterations,
         judged=judged,
+        in_blocks=in_blocks,
         evaluation_episodes=raced,
         evaluation_steps=driven,
         laps_timed=timed + races_timed,

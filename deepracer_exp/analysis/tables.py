@@ -61,8 +61,6 @@ ITERATION_COLUMNS: Mapping[str, str] = {
     "eval_zigzag_per_m": "changes of steering a metre of straight in the evaluation",
 }
 """Names of the columns, with meaning and unit."""
-FINISHED = 0.75
-"""Share of the usual number of episodes below which the last iteration of a metrics file was not finished."""
 CANDIDATE_LAPS = 3
 """Complete laps of an iteration below which its 25th percentile means nothing."""
 DENSE = 0.5
@@ -204,9 +202,6 @@ def _from_metrics_only(recording: Recording, episodes: pd.DataFrame) -> pd.DataF
     """Return the training episodes that are in metrics files only, without a trace."""
     rows = recording.metrics
     rows = rows[(rows["phase"] == "training") & (rows["stream"] == "training")]
-    counts = rows.groupby("iteration").size()
-    if len(counts) > 1 and counts.iloc[-1] < FINISHED * counts.median():
-        rows = rows[rows["iteration"] != counts.index[-1]]  # the job ended within it
     rows = rows[~rows["episode"].isin(episodes["episode"])].rename(columns={"completion": "progress"})
     complete = rows["progress"] >= 100.0
     rows = rows.assign(complete=complete, lap_time_s=rows["time_s"].where(complete), speed_mps=np.nan)

@@ -238,7 +238,7 @@ def test_clones_continue_where_the_one_before_ended(place):
     assert (recording.metrics.set_index("episode")["reward"] == reward).all()
 
 
-def test_drives_that_are_in_the_log_only_are_added_but_for_the_iteration_that_was_not_finished(place):
+def test_iterations_that_are_in_the_log_only_are_added_that_which_the_job_ended_in_among_them(place):
     files = made.console()
     del files["sim-trace/training/training-simtrace/1-iteration.csv"]
     name = next(name for name in files if "training" in name and name.endswith("robomaker.log"))
@@ -246,12 +246,11 @@ def test_drives_that_are_in_the_log_only_are_added_but_for_the_iteration_that_wa
     files[name] = "".join(made.trainer_text(3)) + made.log_text(pd.concat([made.whole_training(), more]))
     recording = read_recording(place(files))
     rows = made.training(recording)
-    assert len(rows) == 36
-    assert rows["iteration"].tolist() == (np.arange(36) // 12).tolist()
-    np.testing.assert_allclose(rows["X"], made.whole_training()["X"], rtol=0, atol=6e-5)
-    (problem,) = recording.problems
-    assert problem.lines == 9
-    assert "9 steps of episodes 6 to 7 are left out: they are in the log only" in problem.reason
+    assert len(rows) == 36 + 9
+    assert rows["iteration"].tolist() == (np.arange(45) // 12).tolist()
+    driven = pd.concat([made.whole_training(), more])
+    np.testing.assert_allclose(rows["X"], driven["X"], rtol=0, atol=6e-5)
+    assert recording.problems == ()
 
 
 def test_a_rolled_log_is_read_in_the_order_of_its_episodes(tmp_path):

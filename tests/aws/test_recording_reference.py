@@ -22,7 +22,9 @@ def recording() -> Recording:
 
 @pytest.fixture(scope="module")
 def training(recording) -> pd.DataFrame:
-    return recording.steps[recording.steps["stream"] == "training"]
+    """The rows of the CSVs: of the iteration in which the job ended there is none."""
+    steps = recording.steps
+    return steps[(steps["stream"] == "training") & (steps["iteration"] < 28)]
 
 
 @pytest.fixture(scope="module")
@@ -57,8 +59,9 @@ def test_the_text_log_reports_the_same_rows_and_the_iteration_that_was_not_finis
     assert (finished["episode_status"].astype(str).to_numpy() == training["episode_status"].astype(str)).all()
     for name in ("X", "Y", "yaw", "progress"):
         assert np.abs(finished[name].to_numpy() - training[name].to_numpy()).max() <= 6e-5
-    (problem,) = recording.problems
-    assert problem.lines == 595
+    assert recording.problems == ()
+    last = recording.steps[recording.steps["iteration"] == 28]
+    assert (len(last), last["episode"].min(), last["episode"].max()) == (595, 560, 563)
 
 
 def test_the_entropy_begins_at_that_of_a_uniform_policy(recording):

@@ -23,7 +23,7 @@ def training_progress(view: LogView) -> Chart | None:
     table = view.iterations
     if not len(table):
         return None
-    verdict = convergence(table, view.action_count, view.stopping)
+    verdict = convergence(view.judged, view.action_count, view.stopping)
     iteration = None if verdict is None else verdict.iteration
     converged = [] if iteration is None else [mark(iteration, "converged", FAINT)]
     progress = curve_layers(table, "completion_mean", BLUE, "mean of the episodes")

@@ -9,7 +9,6 @@ import numpy as np
 from .drives import (
     EPISODES_PER_ITERATION,
     Drives,
-    Ints,
     concatenated,
     first_checkpoint,
     in_degrees,
@@ -21,8 +20,6 @@ from .files import LogFile, Place, place_of, without_worker
 from .parts import Parts, TraceFile
 from .recording import TRAINING, LogProblem
 from .text_log import TrainingLog, join_rolled
-
-_NEARLY = 0.75
 
 
 class JoinedSteps:
@@ -121,15 +118,15 @@ class JoinedSteps:
         elif left.any() and not alike:
             self.drives.append(mine.choose(left))
         elif left.any():
-            self._add_rest(file, mine.choose(left), self.roots[number], _finished(mine))
+            self._add_rest(file, mine.choose(left), self.roots[number])
 
-    def _add_rest(self, file: LogFile, rest: Drives, root: tuple[str, ...], finished: Ints) -> None:
-        """Add the finished iterations that only the log contains."""
+    def _add_rest(self, file: LogFile, rest: Drives, root: tuple[str, ...]) -> None:
+        """Add the iterations that only the log contains: the service writes no CSV of the one that a job ends in."""
         others = [
             part for part in self.drives if (part.place.root, part.place.kind) == (root, rest.place.kind)
         ]
         present = np.unique(np.concatenate([drives.iteration for drives in others]))
-        whole = ~np.isin(rest.iteration, present) & np.isin(rest.iteration, finished)
+        whole = ~np.isin(rest.iteration, present)
         if rest.place.kind == TRAINING and whole.any():
             more, into = rest.choose(whole), others[0]
             iteration = np.concatenate([into.iteration, more.iteration])
@@ -172,18 +169,6 @@ def log_place(files: Sequence[LogFile], log: TrainingLog) -> Place:
     """Return the job of a log, by its name, or by its settings where the name says nothing of a race."""
     place = place_of(files[0].parts)
     return replace(place, kind=log.kind, worker=0) if log.kind and place.kind == TRAINING else place
-
-
-def _finished(log: Drives) -> Ints:
-    """Return the finished iterations of a log.
-
-    All but the last are, and the last is if nearly as many episodes ended in it as in the one before: a job ends in
-    the middle of an episode.
-    """
-    iterations = np.unique(log.iteration)
-    done = log.table["done"].to_numpy()
-    counts = [int(done[log.iteration == iteration].sum()) for iteration in iterations[-2:]]
-    return iterations if len(counts) > 1 and counts[1] >= _NEARLY * counts[0] else iterations[:-1]
 
 
 def uppermost(files: Sequence[tuple[LogFile, Any]]) -> Any:
