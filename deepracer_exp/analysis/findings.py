@@ -13,6 +13,7 @@ from deepracer_exp.runs.result import RunResult
 from deepracer_exp.stopping.judge import POOR, convergence, convergence_rule, overfitting
 
 from . import off_track
+from .beside import raced_beside
 from .log_view import LEAST_EPISODES, LEAST_LAPS, LogView, thirds
 from .off_track import JUDGEMENTS, OffTrackPlace, off_track_places
 from .others import costliest
@@ -206,16 +207,20 @@ def _nothing_to_submit(view: LogView, thresholds: Mapping[str, float]) -> Findin
     laps, at_first = int(view.iterations["complete"].sum()), view.iterations["iteration"] == 0
     before = int(view.iterations["complete"][at_first].sum())
     farthest = view.episodes.loc[view.episodes["progress"].idxmax()]
+    raced = raced_beside(view)
+    lead = "The training names no checkpoint to submit" if raced else "Nothing to submit yet"
     sentence = (
-        f"Nothing to submit yet: no iteration has {CANDIDATE_LAPS} complete laps ({count(laps, 'lap')} in "
+        f"{lead}: no iteration has {CANDIDATE_LAPS} complete laps ({count(laps, 'lap')} in "
         f"all); the farthest episode drove {math.floor(farthest['progress'])}% of the lap in iteration "
         f"{farthest['iteration']}."
     )
     if before >= CANDIDATE_LAPS:
         sentence = (
-            f"Nothing to submit yet: {before} of {count(laps, 'complete lap')} are those of iteration 0, driven by the "
+            f"{lead}: {before} of {count(laps, 'complete lap')} are those of iteration 0, driven by the "
             f"policy that the training began with; no later one has {CANDIDATE_LAPS}."
         )
+    if raced:
+        sentence += f" What was raced beside it: {raced}."
     return Finding("submit", sentence, {"laps": laps, "progress": float(farthest["progress"])}, thresholds)
 
 

@@ -9,6 +9,7 @@ import pandas as pd
 from deepracer_exp.errors import count
 
 from .against_fastest import loss_in_words
+from .beside import other_tracks, raced_beside
 from .charts.runs import run_folder
 from .log_view import LogView
 from .zigzag import zigzag_in_words, zigzag_now
@@ -129,11 +130,8 @@ def facts(view: LogView) -> list[tuple[str, str]]:
     if course is not None:
         way = ", reversed" if course.reversed else ""
         lines.append(("Course", f"{course.title}{way}: {course.length_m:.2f} m, {course.width_m:.2f} m wide"))
-    others = [
-        str(name) for name in recording.steps["track"].unique() if str(name) not in ("", view.track_name)
-    ]
-    if others:
-        lines.append(("Other courses in it", ", ".join(others)))
+    if elsewhere := other_tracks(view):
+        lines.append(("Other tracks in it", f"{elsewhere}; one of them: --track NAME"))
     several = trainings(view)
     if several is not None:
         lines.append(("Trainings in it", several))
@@ -147,8 +145,7 @@ def facts(view: LogView) -> list[tuple[str, str]]:
         if view.run is None:  # a run of ours has default sensors there, whatever its policy sees
             space += f"; sensors {', '.join(recording.metadata.sensor) or NONE}"
         lines.append(("Action space", space))
-    driven = view.evaluation_episodes
-    races = driven if view.trained else driven.iloc[:0]
+    races = view.evaluation_episodes.iloc[: None if view.trained else 0]
     laps = int(view.episodes["lap_time_s"].notna().sum() + races["lap_time_s"].notna().sum())
     if laps:
         counted = "counted from the reset, one control step before the first row, to the last row"
@@ -162,9 +159,8 @@ def facts(view: LogView) -> list[tuple[str, str]]:
     folder = run_folder(view)
     if folder is not None and view.episodes["lap_time_s"].notna().any():
         lines.append(("Against the fastest lap", loss_in_words(view, folder)))
-    if len(driven):
-        streams = count(driven["stream"].nunique(), "evaluation")
-        lines.append(("Evaluations", f"{count(len(driven), 'episode')} in {streams}"))
+    if raced := raced_beside(view):
+        lines.append(("Races and evaluations", raced))
     return lines
 
 
@@ -195,9 +191,12 @@ def headline(view: LogView) -> str:
     else:
         races = count(view.episodes["stream"].nunique(), "race")
         sentence = f"No training; {steps} in {finished} of {races}"
+    raced = raced_beside(view)
+    beside = f" Beside it {raced}." if raced else ""
     if not laps:
         resets = f"no lap without a reset, {count(with_resets, 'complete lap')} with resets"
-        return f"{sentence}; {resets if with_resets else 'no complete lap'}."
+        none = f"no complete {view.lap_word if raced else 'lap'}"
+        return f"{sentence}; {resets if with_resets else none}.{beside}"
     more = f"; {count(with_resets, 'more lap')} with resets" if with_resets else ""
     best = f", the fastest in {best_s:.2f} s" if math.isfinite(best_s) else ""
-    return f"{sentence}; {count(laps, f'complete {view.lap_word}')}{best}{more}."
+    return f"{sentence}; {count(laps, f'complete {view.lap_word}')}{best}{more}.{beside}"

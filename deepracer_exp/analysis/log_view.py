@@ -293,6 +293,7 @@ def prepare(log: Recording | RunRecording | EvaluationRecording, track: str | No
         if course_now is not None and not was_driven_on(course, driven_on):
             raise BadInput(recording.name, f"track={track} was not driven on", course_now.name)
     course = estimated_course(name, driven_on) if course is None else numbered_as_logged(course, driven_on)
+    recording = _on_course(recording, here & training)
     discount = float((recording.hyperparameters or {}).get("discount_factor", DISCOUNT))
     trained, episodes, timed = _episodes(recording, here & training, course, discount)
     driven, raced, races_timed = _episodes(recording, here & ~training, course, discount)
@@ -332,6 +333,28 @@ def prepare(log: Recording | RunRecording | EvaluationRecording, track: str | No
         placed=placed,
         run=run,
     )
+
+
+def _on_course(recording: Recording, here: NDArray[np.bool_]) -> Recording:
+    """Return a recording without updates and metrics of iterations that were driven on other tracks only.
+
+    `here` says of each row whether it is one of the training on the course. An iteration without a row belongs to the
+    one before it.
+    """
+    training = (recording.steps["stream"] == TRAINING).to_numpy()
+    number = recording.steps["iteration"].to_numpy()
+    driven = np.unique(number[training])
+    is_here = np.isin(driven, number[here])
+    if is_here.all():
+        return recording
+
+    def kept(rows: pd.DataFrame) -> NDArray[np.bool_]:
+        before = np.searchsorted(driven, rows["iteration"], side="right") - 1
+        return is_here[np.maximum(before, 0)]
+
+    updates, metrics = recording.updates, recording.metrics
+    of_training = (metrics["stream"] == TRAINING).to_numpy()
+    return replace(recording, updates=updates[kept(updates)], metrics=metrics[~of_training | kept(metrics)])
 
 
 def _episodes(

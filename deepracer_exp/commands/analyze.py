@@ -106,6 +106,7 @@ def _analyze(args: argparse.Namespace) -> int:
 
         reward = named_reward_source(args.reward)
 
+    from deepracer_exp.analysis.beside import other_tracks
     from deepracer_exp.analysis.findings import findings
     from deepracer_exp.analysis.log_tables import headline, trainings
     from deepracer_exp.analysis.log_view import prepare
@@ -148,6 +149,8 @@ def _analyze(args: argparse.Namespace) -> int:
     several = trainings(view)
     if several is not None:
         print(f"     trainings in it: {several}. One alone: give its files in a folder of their own")
+    if elsewhere := other_tracks(view):
+        print(f"     not on this page, driven on other tracks: {elsewhere}; one of them: --track NAME")
     for number, finding in enumerate(sentences, 1):
         print(f"{number:3d}  {finding.sentence}")
     for sentence in replay.sentences if replay is not None else ():

@@ -131,23 +131,26 @@ def _item(word: str, group: str | None, stores: Stores) -> Item:
 
 def _compare_recordings(args: argparse.Namespace, items: Sequence[Item]) -> int:
     """Compare how logs, and runs among them, learned."""
+    from deepracer_exp.analysis.beside import evaluated_in_training
     from deepracer_exp.analysis.charts.runs import (
         generalisation_matrix,
         generations,
         policy_of,
         recordings_compared,
     )
-    from deepracer_exp.analysis.log_tables import Table, headline
+    from deepracer_exp.analysis.log_tables import NONE, Table, headline
     from deepracer_exp.analysis.log_view import prepare
     from deepracer_exp.reports.lap_replay import laps_of_log
     from deepracer_exp.runs.recording import read_log
 
     named: list[tuple[str | None, LogView]] = []
     whole: list[LogView] = []
+    rows: list[tuple[str, ...]] = []
     for item in items:
         for path in item.paths:
             view = prepare(read_log(path), args.track)
             whole += [view] * (args.replay is not None)
+            rows.append((view.name, headline(view), evaluated_in_training(view) or NONE))
             named.append((item.group, light(view)))
     views = [view for _, view in named]
     charts = [
@@ -155,8 +158,10 @@ def _compare_recordings(args: argparse.Namespace, items: Sequence[Item]) -> int:
         generations(views),
         generalisation_matrix(list(map(policy_of, views))),
     ]
-    table = Table(("recording", "driven"), tuple((view.name, headline(view)) for view in views), 2)
-    notes = ["Logs know the laps of the training only, driven by a policy that explores."]
+    table = Table(("recording", "driven", "evaluated in the training, the best"), tuple(rows), 3)
+    notes = [
+        "A training explores while it drives its laps; an evaluation or a race drives those of the policy itself."
+    ]
     out = write_comparison_page(args.output, items, notes, [("Recordings", table, "")], charts)
     if args.replay is not None:
         write_laps(args.replay, laps_of_log(whole[0], whole[1]))

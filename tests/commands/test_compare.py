@@ -128,6 +128,20 @@ def test_simulated_laps_stand_beside_those_of_logs(run_dir, logs, call, tmp_path
     assert call("compare", logs, str(run_dir)).code == 0
 
 
+def test_logs_are_compared_by_what_analyze_says_of_each(call, reference, tmp_path):
+    inputs = reference / "inputs/fourth"
+    slow, fast = (str(inputs / f"05-compare-two-logs/{name}-robomaker.log") for name in "ab")
+    evaluated = str(inputs / "02-evaluated-checkpoint")
+    ended = call("compare", slow, fast, evaluated, "-o", "logs.html")
+    assert ended.code == 0, ended.stderr
+    said = page_of(tmp_path / "logs.html").text
+    for log in (slow, fast, evaluated):
+        headline = call("analyze", log, "-o", "one.html").stdout.splitlines()[0].partition(": ")[2]
+        assert headline in said
+        assert not headline.startswith("0 control steps")
+    assert "1_Step-265: 3 of 3 laps, 10.10 s" in said
+
+
 def test_runs_and_several_logs_show_how_they_learned(run_dir, logs, call, tmp_path):
     shutil.copytree(tmp_path / logs, tmp_path / "more")
     ended = call("compare", str(run_dir), logs, "more", "-o", "all.html")

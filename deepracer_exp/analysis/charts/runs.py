@@ -131,7 +131,8 @@ def generations(views: Sequence[LogView]) -> Chart | None:
         starts = starts or [(first, group_name(view.name))]
         number = np.searchsorted([start for start, _ in starts[1:]], table["iteration"], "right")
         moved = table.assign(iteration=table["iteration"] + offset - first)
-        parts += [(name, moved[number == index]) for index, (_, name) in enumerate(starts)]
+        # A training on another track has no iteration here.
+        parts += [(name, moved[number == k]) for k, (_, name) in enumerate(starts) if (number == k).any()]
         offset = int(moved["iteration"].max()) + 1
     if len(parts) < 2:
         return None
