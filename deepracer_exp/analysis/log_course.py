@@ -151,7 +151,7 @@ def _misjudged(track: Track, sample: pd.DataFrame, car: CarConfig) -> float:
     """Return the share of rows whose `all_wheels_on_track`, in time or late, is not what a course's borders say."""
     on_road = recorded_wheels_on_road(Tracks([track]), np.zeros(1, np.intp), sample, car).all(axis=1)
     logged = sample[["all_wheels_on_track", "late_wheels"]].to_numpy(bool)
-    return float(np.mean(on_road[:, None] != logged, axis=0).min())
+    return min(float(np.mean(on_road != column)) for column in logged.T)
 
 
 def _with_late_wheels(steps: pd.DataFrame, rows: NDArray[np.intp]) -> pd.DataFrame:

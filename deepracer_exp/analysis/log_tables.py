@@ -136,8 +136,8 @@ def facts(view: LogView) -> list[tuple[str, str]]:
     if several is not None:
         lines.append(("Trainings in it", several))
     if recording.model_checkpoints:
-        words = {"best_checkpoint": "the best by the service's evaluations", "last_checkpoint": "the last"}
-        names = [f"{name}, {words.get(key, key)}" for key, name in recording.model_checkpoints.items()]
+        which = {"best_checkpoint": "the best by the service's evaluations", "last_checkpoint": "the last"}
+        names = [f"{name}, {which.get(key, key)}" for key, name in recording.model_checkpoints.items()]
         lines.append(("Checkpoints in the model's folder", "; ".join(names)))
     if recording.metadata is not None:
         actions = recording.metadata.actions
