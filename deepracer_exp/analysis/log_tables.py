@@ -131,7 +131,7 @@ def facts(view: LogView) -> list[tuple[str, str]]:
         way = ", reversed" if course.reversed else ""
         lines.append(("Course", f"{course.title}{way}: {course.length_m:.2f} m, {course.width_m:.2f} m wide"))
     if elsewhere := other_tracks(view):
-        lines.append(("Other tracks in it", f"{elsewhere}; one of them: --track NAME"))
+        lines.append(("Other tracks in it", f"{elsewhere}; --track chooses one"))
     several = trainings(view)
     if several is not None:
         lines.append(("Trainings in it", several))

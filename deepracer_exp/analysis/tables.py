@@ -247,9 +247,9 @@ def candidates(recording: Recording, iterations: pd.DataFrame) -> pd.DataFrame:
     (deepracer-simapp, markov/rollout_worker.py). What drove the first iteration is a network that has learned nothing,
     and no candidate, unless its name says that it is a model that was cloned.
     """
-    known = recording.checkpoints
+    checkpoints = recording.checkpoints
     began = [part.first_iteration for part in recording.rounds] or [0]
-    untrained = [k for k in began if known.get(k, UNTRAINED).startswith(UNTRAINED)]
+    untrained = [k for k in began if checkpoints.get(k, UNTRAINED).startswith(UNTRAINED)]
     rows = _evaluation_rows(recording)
     groups = rows.assign(time_s=rows["time_s"].where(rows["lap"])).groupby("iteration")
     raced = pd.DataFrame(
@@ -270,5 +270,5 @@ def candidates(recording: Recording, iterations: pd.DataFrame) -> pd.DataFrame:
         enough = trained["lap_time_p25_s"].notna() & (trained["complete"] >= CANDIDATE_LAPS)
         dense = trained["lap_share"] >= DENSE * trained.loc[enough, "lap_share"].max()
         ranked = trained[enough & dense].sort_values("lap_time_p25_s", kind="stable")
-    named = ranked.assign(checkpoint=[known.get(k, "") for k in ranked["iteration"]])
+    named = ranked.assign(checkpoint=[checkpoints.get(k, "") for k in ranked["iteration"]])
     return named.head(MOST_CANDIDATES).reset_index(drop=True)[list(CANDIDATE_COLUMNS)]

@@ -150,7 +150,7 @@ def _analyze(args: argparse.Namespace) -> int:
     if several is not None:
         print(f"     trainings in it: {several}. One alone: give its files in a folder of their own")
     if elsewhere := other_tracks(view):
-        print(f"     not on this page, driven on other tracks: {elsewhere}; one of them: --track NAME")
+        print(f"     not on this page, driven on other tracks: {elsewhere}; --track chooses one")
     for number, finding in enumerate(sentences, 1):
         print(f"{number:3d}  {finding.sentence}")
     for sentence in replay.sentences if replay is not None else ():
