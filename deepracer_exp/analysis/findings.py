@@ -240,7 +240,9 @@ def _checkpoint(view: LogView, name: str) -> str:
             "that drove"
         )
     if view.recording.checkpoints_counted:
-        return f"the checkpoint {name} (no file names it: this is the count, and that of a clone goes on), which drove"
+        return (
+            f"the checkpoint {name} (no file names it: counted as if the training were no clone), which drove"
+        )
     cloned = ", the model that was cloned," if name.endswith("_Step-0") else ","
     return f"the checkpoint {name}{cloned} which drove"
 

@@ -55,7 +55,7 @@ def test_a_name_that_is_counted_alone_is_called_that(tmp_path):
     assert recording.checkpoints[1] == "1_Step-12"
     assert recording.checkpoints_counted
     sentence = next(finding.sentence for finding in findings(prepare(recording)) if finding.rule == "submit")
-    assert "(no file names it: this is the count, and that of a clone goes on)" in sentence
+    assert "(no file names it: counted as if the training were no clone)" in sentence
 
 
 def test_a_file_without_names_of_checkpoints_is_a_problem(tmp_path):
