@@ -3,9 +3,9 @@
     python -m benchmarks.lap_bounds [--json FILE]
 
 For each world with boards of time trials since March 2020 (`deepracer_exp/tracks/boards.csv`) and each car of their
-time, the fastest official lap stands beside the least time of a flying lap (`tracks.line_time`), with all that the
-simulated car can do within its own limits. A bound above a record says that the simulated car cannot do what a car of
-the service did.
+time (that of version 4 stands in for version 3), the fastest official lap stands beside the least time of a flying lap
+(`tracks.line_time`), with all that the simulated car can do within its own limits. A bound above a record says that the
+simulated car cannot do what a car of the service did.
 """
 
 import sys

@@ -13,7 +13,10 @@ from typing import Any, Literal
 from deepracer_exp.config.custom_files import CARS
 
 FILE = Path(__file__).with_name("boards.csv")
-_VERSION_5_SINCE = "2022"
+_VERSION_5_SINCE = "2022-07-21"
+"""Models raced on 3 July 2022 state simulation version 4, the first known ones that state version 5 are of this day."""
+_VERSION_4_SINCE = "2020-10"
+"""Models of August and September 2020 state version 3. When version 4 came after that is not known."""
 _ORDER = {"TOTAL_TIME": "total of", "AVG_LAP_TIME": "average of", "BEST_LAP_TIME": "best of"}
 
 
@@ -42,8 +45,13 @@ class Board:
     half_s: float
 
     @property
+    def is_of_version_3(self) -> bool:
+        """Whether simulation version 3 drove then, of which there is no car."""
+        return self.date < _VERSION_4_SINCE
+
+    @property
     def car(self) -> str:
-        """Return the option of the car that drove then: simulation version 5 came with 2022."""
+        """Return the option of the car that drove then; that of version 4 stands in for version 3."""
         return CARS[5 if self.date >= _VERSION_5_SINCE else 4]
 
     @property
@@ -105,7 +113,7 @@ class Standing:
 
     @property
     def is_comparable(self) -> bool:
-        """Whether the car is that of the board's time."""
+        """Whether the car is that of the board's time, or the one that stands in for it."""
         return self.car == self.board.car
 
     @property
@@ -114,11 +122,17 @@ class Standing:
         board = self.board
         lap = f"a best lap of {self.lap_s:.2f} s" if self.is_best else f"{self.lap_s:.2f} s a lap"
         differs = f"driven with {self.car} from {self.sees}, the board's racers "
-        differs += f"{f'with {board.car} ' * (not self.is_comparable)}from a camera"
+        if board.is_of_version_3:
+            differs += "with simulation version 3 "
+        elif not self.is_comparable:
+            differs += f"with {board.car} "
+        differs += "from a camera"
         if self.off_track is not None:
             differs += f"; {self.off_track}"
         if not self.is_comparable:
             differs += f"; to compare, train with car={board.car}"
+        if board.is_of_version_3:
+            differs += f"; there is no car of version 3, and {board.car} stands in for it"
         place = f"{lap} would {board.place(self.lap_s)}"
         return f"{board.board} ({board.racers:,} racers, {board.terms}): {place}; {differs}"
 

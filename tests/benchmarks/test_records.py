@@ -32,7 +32,7 @@ def test_laps_stand_beside_the_fastest_lap_its_bound_and_the_record(tmp_path, mo
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     (board, *_) = boards.boards()
     monkeypatch.setattr(
-        records, "boards_of", lambda _: (board, replace(board, date="2022-01-01", record_s=3.0))
+        records, "boards_of", lambda _: (board, replace(board, date="2022-08-01", record_s=3.0))
     )
     asked = ["--seeds", "1", "--steps", "32768", "--tracks", "Straight_track"]
     assert records.main([*asked, "--json", str(tmp_path / "records.json")]) == 0

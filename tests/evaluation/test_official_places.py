@@ -48,7 +48,10 @@ def test_a_camera_and_the_car_are_named():
     (one, _) = places(
         driven("Albert", 14.0), overrides=("observation=camera", "car=deepracer_v4", "network=cnn_small")
     )["Albert"]
-    assert "driven with deepracer_v4 from a camera, the board's racers from a camera" in one.words
+    assert (
+        "driven with deepracer_v4 from a camera, the board's racers with simulation version 3 from a camera"
+        in (one.words)
+    )
 
 
 @pytest.fixture

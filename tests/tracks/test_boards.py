@@ -2,12 +2,15 @@
 
 import itertools
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.aws.worlds.catalogue import worlds
 from deepracer_exp.aws.worlds.routes import world_rows
+from deepracer_exp.config.custom_files import CARS
 from deepracer_exp.config.options import options
 from deepracer_exp.tracks import boards
 from deepracer_exp.tracks.boards import Board, boards_of, standings, what_it_sees
@@ -42,6 +45,39 @@ def test_there_are_sixty_boards_and_none_of_a_track_driven_the_other_way():
     assert boards_of("reInvent2019_track_cw") == boards_of("reinvent_base") == ()
 
 
+@pytest.mark.parametrize(
+    ("date", "car", "is_of_version_3"),
+    [
+        ("2020-03-02", "deepracer_v4", True),
+        ("2020-09-01", "deepracer_v4", True),
+        ("2020-10-01", "deepracer_v4", False),
+        ("2022-07-01", "deepracer_v4", False),
+        ("2022-08-01", "deepracer_v5", False),
+        ("2025-01-07", "deepracer_v5", False),
+    ],
+)
+def test_the_car_of_a_board_is_that_of_its_time_and_version_4_stands_in_for_version_3(
+    date, car, is_of_version_3
+):
+    board = next(board for board in ALL if board.date == date)
+    assert (board.car, board.is_of_version_3) == (car, is_of_version_3)
+
+
+def test_models_raced_on_a_day_state_the_version_of_the_boards_car(reference):
+    """Logs of a leaderboard of 3 July 2022 state version 4; the first known ones of version 5 are of 21 July."""
+    june = next(board for board in ALL if board.date == "2022-06-01")
+    (log,) = (reference / "console_training/logs/leaderboard").glob(
+        "leaderboard-20220703172842-*-robomaker.log"
+    )
+    for file, day in (
+        (log, "2022-07-03"),
+        (reference / "race_pace/console_v5_reinvent_base.log.gz", "2022-07-21"),
+    ):
+        metadata = read_recording(file).metadata
+        assert metadata is not None
+        assert replace(june, date=day).car == CARS[metadata.version]
+
+
 def test_a_place_is_said_as_far_as_the_board_says_it():
     (board,) = boards_of("2022_april_open")
     assert board.place(14.0) == "have won (14.80 s won)"
@@ -59,9 +95,9 @@ def test_a_faster_lap_never_has_a_worse_place(board: Board):
 
 
 def test_a_sentence_says_who_raced_there_how_and_what_differs():
-    (one,) = stand("2022_april_open", 15.1)
+    (one,) = stand("2022_august_open", 28.0)
     assert one.words == (
-        "April Qualifier 2022 (1,728 racers, total of 3 laps): 15.10 s a lap would be among the first 1 % (14.80 s "
+        "August Qualifier 2022 (4,197 racers, total of 3 laps): 28.00 s a lap would be among the first 1 % (14.44 s "
         "won); driven with deepracer_v5 from features, the board's racers from a camera; leaving the track cost 3 s "
         "there, here it ends a lap"
     )
@@ -69,12 +105,23 @@ def test_a_sentence_says_who_raced_there_how_and_what_differs():
 
 
 def test_another_car_is_not_comparable_and_how_to_compare_is_said():
-    (one,) = stand("2022_april_open", 15.1, car="deepracer_v6", off_track_penalty_s=3.0)
+    (one,) = stand("2022_april_open", 15.1, car="deepracer_v5", off_track_penalty_s=3.0)
     assert not one.is_comparable
     assert one.words.endswith(
-        "driven with deepracer_v6 from features, the board's racers with deepracer_v5 from a camera; to compare, "
-        "train with car=deepracer_v5"
+        "driven with deepracer_v5 from features, the board's racers with deepracer_v4 from a camera; to compare, "
+        "train with car=deepracer_v4"
     )
+
+
+@pytest.mark.parametrize("car", ["deepracer_v4", "deepracer_v6"])
+def test_a_board_of_version_3_says_that_another_car_stands_in_for_it(car):
+    (one,) = (
+        stand("Belille", 20.0, car=car)[-1:] if car == "deepracer_v6" else stand("Belille", 20.0, car=car)[:1]
+    )
+    assert one.board.date == "2020-09-01"
+    assert "the board's racers with simulation version 3 from a camera" in one.words
+    assert one.words.endswith("; there is no car of version 3, and deepracer_v4 stands in for it")
+    assert ("; to compare, train with car=deepracer_v4" in one.words) == (not one.is_comparable)
 
 
 @pytest.mark.parametrize("car", ["deepracer_v4", "deepracer_v5"])
