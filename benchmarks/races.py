@@ -67,7 +67,7 @@ class Board:
     race: str
     """Option of conf/race with the others of the board."""
     car: str
-    """Option of conf/car of that time."""
+    """Option of conf/car of that time; that of version 4 stands in for version 3 of 2020."""
     off_track_s: float
     """Penalty for leaving the track; running into another cost 5 s on all of them."""
     winner_s: float

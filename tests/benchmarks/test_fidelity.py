@@ -88,11 +88,18 @@ def test_each_version_is_measured_with_its_own_car_by_band_and_recording_and_dra
     assert "version 6, car=deepracer_v6" in capsys.readouterr().out
 
 
-def test_the_car_of_version_6_is_as_fast_as_the_recorded_one_and_turns_as_far_in_sustained_bends(reference):
-    (fast,) = read_recorded([reference / "race_pace/droa_v6_fast.tar.gz"])
-    some = fast.windows["one_second"]
+@pytest.mark.parametrize(
+    ("recording", "error_m", "bends", "turned_too_far"),
+    # In the second the commanded speed alternates between 1.33 and 4 m/s: docs/fidelity.md, What is not reached.
+    [("droa_v6_fast", 0.065, 200, 0.04), ("droa_v6_alternating", 0.175, 20, 0.09)],
+)
+def test_the_car_of_version_6_is_as_fast_as_the_recorded_one_and_turns_as_far_in_sustained_bends(
+    reference, recording, error_m, bends, turned_too_far
+):
+    (recorded_drives,) = read_recorded([reference / f"race_pace/{recording}.tar.gz"])
+    some = recorded_drives.windows["one_second"]
     path = replay(CAR, some)
-    assert np.median(errors(path, some).distance_m[:, -1]) < 0.065
+    assert np.median(errors(path, some).distance_m[:, -1]) < error_m
     driven, recorded = (
         np.hypot(*np.diff(poses[..., :2], axis=1).transpose(2, 0, 1)).sum(axis=1)
         for poses in (path, some.truth)
@@ -103,8 +110,8 @@ def test_the_car_of_version_6_is_as_fast_as_the_recorded_one_and_turns_as_far_in
         np.sign(steering) == np.sign(steering[:, :1])
     ).all(axis=1)
     turned, turned_recorded = (poses[bend, -1, 2] - some.start[bend, 2] for poses in (path, some.truth))
-    assert bend.sum() > 200
-    assert np.median(turned / turned_recorded) == pytest.approx(1.0, abs=0.04)
+    assert bend.sum() > bends
+    assert np.median(turned / turned_recorded) == pytest.approx(1.0, abs=turned_too_far)
 
 
 def test_a_recording_left_out_is_predicted_by_a_car_that_has_not_seen_it(
