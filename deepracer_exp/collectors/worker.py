@@ -141,6 +141,10 @@ class _StateKeepingEnv(RaceEnv):
         self._draw()
         self.observation_spec[NOISE] = Unbounded((race.n_cars, width), dtype=torch.float64)
 
+    def fake_tensordict(self) -> TensorDictBase:
+        """Return what a batch holds of a step: `trace` under `next` alone, where the training reads it."""
+        return super().fake_tensordict().exclude("trace")
+
     def take_state(self) -> dict[str, Any]:
         """Return the state of the cars, and how many actions each has drawn numbers for."""
         return {"race": self.race.state_dict(), "drawn": self._noise.steps}

@@ -21,8 +21,9 @@ class RaceEnv(EnvBase):
 
     Keys: `observation` (float32 features), with a camera `pixels` (uint8, channels x height x width), with a LIDAR
     `lidar` (float32), `action` (int64 index, or float32 steering and speed in -1..1), and under `next` also `reward`,
-    `done`, `terminated`, `truncated` and `trace` (float64, columns those of `Race.trace`). `trace` is part
-    of the reward spec because it exists only after a step.
+    `done`, `terminated` and `truncated`. `trace` (float64, columns those of `Race.trace`) is the last step that each
+    car has made, at the start of an episode that of the one before. Like the `info` of Gymnasium's environments in
+    TorchRL it is among the observations, so that transforms of rewards leave it alone; no policy of ours reads it.
     """
 
     def __init__(self, race: Race, on_step: Callable[[], None] | None = None):
@@ -37,7 +38,9 @@ class RaceEnv(EnvBase):
         n_cars, size = race.observation.shape
         n_actions = race.setup.actions.n
         self.observation_spec = Composite(
-            observation=Unbounded((n_cars, size), dtype=torch.float32), shape=(n_cars,)
+            observation=Unbounded((n_cars, size), dtype=torch.float32),
+            trace=Unbounded(race.trace.shape, dtype=torch.float64),
+            shape=(n_cars,),
         )
         if "pixels" in race.seen:
             self.observation_spec["pixels"] = Bounded(0, 255, race.pixels.shape, dtype=torch.uint8)
@@ -48,11 +51,7 @@ class RaceEnv(EnvBase):
             if n_actions is None
             else Categorical(n_actions, shape=(n_cars,), dtype=torch.int64)
         )
-        self.full_reward_spec = Composite(
-            reward=Unbounded((n_cars, 1), dtype=torch.float32),
-            trace=Unbounded(race.trace.shape, dtype=torch.float64),
-            shape=(n_cars,),
-        )
+        self.reward_spec = Unbounded((n_cars, 1), dtype=torch.float32)
         flags = {key: Categorical(2, shape=(n_cars, 1), dtype=torch.bool) for key in _FLAGS}
         self.full_done_spec = Composite(flags, shape=(n_cars,))
         self._no = torch.zeros(n_cars, 1, dtype=torch.bool)
@@ -119,6 +118,7 @@ class RaceEnv(EnvBase):
         """Return the observations, with all flags of the end of an episode False."""
         flags = {key: self._no.clone() for key in _FLAGS}
         seen = {key: torch.from_numpy(values) for key, values in self.seen.items()}
+        seen["trace"] = torch.from_numpy(self.race.trace.copy())
         return TensorDict._new_unsafe({**seen, **flags}, batch_size=self.batch_size, device=self.device)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -49,6 +49,7 @@ def test_a_batch_has_cars_first_and_time_last_in_whole_steps_of_all_cars(collect
     for _ in range(3):
         batch = collection.next_batch()
         assert batch.batch_size == (8, 8)
+        assert "trace" not in batch.keys()  # noqa: SIM118 - once a step is enough
         trace = batch["next", "trace"].numpy()
         cars = trace[:, :, PACKED["car"]]
         assert (cars == cars[:, :1]).all()

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, RewardSum, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from deepracer_exp.env.race import Race
@@ -84,6 +84,20 @@ def test_the_rewards_of_the_trace_are_the_rewards(setup_of):
     trace = steps["next", "trace"]
     torch.testing.assert_close(trace[..., PACKED["reward"]].float(), steps["next", "reward"][..., 0])
     assert ((trace[..., PACKED["done"]] == 1) == steps["next", "done"][..., 0]).all()
+
+
+def test_the_sum_of_an_episodes_rewards_is_that_of_the_reward_alone(setup_of):
+    env = TransformedEnv(RaceEnv(Race(setup_of("episode.max_steps=8"), 3)), RewardSum())
+    assert list(env.reward_keys) == ["reward"]
+    steps = env.rollout(20, break_when_any_done=False)
+    assert [key for key in steps["next"].keys() if key.startswith("episode_")] == ["episode_reward"]  # noqa: SIM118
+    torch.testing.assert_close(steps["next", "episode_reward"][:, 7], steps["next", "reward"][:, :8].sum(1))
+
+
+def test_a_car_at_its_start_shows_the_last_step_that_it_made(setup_of):
+    steps = RaceEnv(Race(setup_of("episode.max_steps=5"), 3)).rollout(12, break_when_any_done=False)
+    assert not steps["trace"][:, 0, PACKED["steps"]].any()
+    assert torch.equal(steps["trace"][:, 1:], steps["next", "trace"][:, :-1])
 
 
 def test_the_heartbeat_is_called_after_every_step(setup_of):
