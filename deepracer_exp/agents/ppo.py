@@ -103,7 +103,7 @@ class PPO(Algorithm):
             device=device,
         )
         self._smoothness: Smoothness | None = None
-        fits = device == _CPU and InnerLoop.fits(actor_critic)
+        fits = config.compiled and device == _CPU and InnerLoop.fits(actor_critic)
         self._compiled = InnerLoop(actor_critic, self._optimizer, config) if fits else None
 
     def smooth(self, commands: Tensor | None) -> None:
