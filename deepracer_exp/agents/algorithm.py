@@ -57,6 +57,10 @@ class Algorithm:
         """
         self.networks, self.config, self.schedule = networks, config, schedule
 
+    def rates(self, iteration: int, fraction: float) -> dict[str, float]:
+        """Return what the schedules lead to in the coming update, by its name; arguments as of `update`."""
+        return {"learning rate": self.config.lr * self.schedule.factor(iteration, fraction)}
+
     def update(self, batch: TensorDictBase, iteration: int, fraction: float) -> UpdateMetrics:
         """Learn from one batch.
 
@@ -65,7 +69,7 @@ class Algorithm:
                 `action`, `action_log_prob` and `next` with `observation` (of a finished episode: its last one, not
                 the first of the new one), `reward`, `done`, `terminated`, each of the latter [..., T, 1].
             iteration: Updates made before this one.
-            fraction: Share of the budget spent, 0 to 1.
+            fraction: Share of the budget spent, 0 to 1; with `budget.schedule_until`, of that part of it.
 
         Raises:
             RunFailed: Input, loss or gradient is not finite; the networks are as before that gradient step.

@@ -140,13 +140,17 @@ class PPO(Algorithm):
             )
         return losses
 
+    def rates(self, iteration: int, fraction: float) -> dict[str, float]:
+        """Return the learning rate and the weight of the entropy bonus, see `Algorithm.rates`."""
+        coeff, end = self.config.entropy_coeff, self.config.entropy_end_factor
+        return super().rates(iteration, fraction) | {"entropy bonus": coeff * (1 + (end - 1) * fraction)}
+
     def update(self, batch: TensorDictBase, iteration: int, fraction: float) -> UpdateMetrics:
         """Run all epochs on one batch, see `Algorithm.update`."""
-        lr = self.config.lr * self.schedule.factor(iteration, fraction)
+        rates = self.rates(iteration, fraction)
+        lr, entropy_coeff = rates["learning rate"], rates["entropy bonus"]
         for group in self._optimizer.param_groups:
             group["lr"] = lr
-        config = self.config
-        entropy_coeff = config.entropy_coeff * (1 + (config.entropy_end_factor - 1) * fraction)
         self._loss.entropy_coeff.fill_(entropy_coeff)
         if self._learner is not self.networks:
             self._learner.load_state_dict(self.networks.state_dict())

@@ -94,7 +94,7 @@ class SAC(Algorithm):
     def update(self, batch: TensorDictBase, iteration: int, fraction: float) -> SACMetrics:
         """Add the batch to the replay and learn from it, see `Algorithm.update`."""
         require_finite(batch)
-        lr = self.config.lr * self.schedule.factor(iteration, fraction)
+        lr = self.rates(iteration, fraction)["learning rate"]
         for group in self._optimizer.param_groups:
             group["lr"] = lr
         self.replay.extend(batch)

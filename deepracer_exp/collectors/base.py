@@ -96,6 +96,11 @@ def worker_count(config: CollectorConfig) -> int:
     return config.processes or max(n for n in config.accepted_processes if n <= cores())
 
 
+def steps_per_batch(config: CollectorConfig, frames: int) -> int:
+    """Return the steps of each car in a batch of so many frames over all cars, rounded up to whole steps of all."""
+    return -(-frames // config.cars)
+
+
 def cars_per_process(config: CollectorConfig) -> int:
     """Return how many of the cars drive in each process."""
     return config.cars // max(1, worker_count(config))

@@ -24,7 +24,7 @@ from deepracer_exp.errors import RunFailed
 from deepracer_exp.runs.crash_dump import read_crash_dump
 from deepracer_exp.runs.files import HEARTBEAT
 
-from .base import Collector, by_worker, cars_per_process, states_of, worker_count
+from .base import Collector, by_worker, cars_per_process, states_of, steps_per_batch, worker_count
 from .sampling import SamplingPolicy
 from .watchdog import Watchdog
 from .worker import CarCollector, EnvFactory
@@ -64,10 +64,9 @@ class LocalCollector(Collector):
         states = states_of(self._begun_from, max(1, self._workers))
         self._watchdog: Watchdog | None = None
         cars = cars_per_process(config)
-        steps_per_batch = -(-frames_per_batch // config.cars)
         factory = functools.partial(EnvFactory, setup=setup, n_cars=cars, run_dir=run_dir, rivals=rivals)
         options: dict[str, Any] = {
-            "frames_per_batch": steps_per_batch * config.cars,
+            "frames_per_batch": steps_per_batch(config, frames_per_batch) * config.cars,
             "total_frames": -1,
             "use_buffers": True,
             "trust_policy": True,

@@ -21,7 +21,7 @@ from deepracer_exp.runs.crash_dump import write_crash_dump
 from deepracer_exp.runs.files import REWARD_PRINTS
 
 from . import ray_cluster
-from .base import Collector, by_worker, cars_per_process, states_of
+from .base import Collector, by_worker, cars_per_process, states_of, steps_per_batch
 from .sampling import SamplingPolicy
 from .worker import CarCollector, EnvFactory
 
@@ -181,7 +181,7 @@ class RayCollector(Collector):
         rivals: Rivals | None,
     ) -> None:
         cars = cars_per_process(config)
-        frames = -(-frames_per_batch // config.cars) * cars
+        frames = steps_per_batch(config, frames_per_batch) * cars
         threads = config.threads or 1
         factories = [
             EnvFactory(

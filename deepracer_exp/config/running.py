@@ -101,6 +101,7 @@ class BudgetConfig:
     alerts: tuple[Percent, ...]
     alert_command: Annotated[str, Field(min_length=1)] | None
     alert_webhook: EnvironmentVariable | None
+    schedule_until: Positive = 1.0
 
     def __post_init__(self) -> None:
         """Refuse a run without an end, and a limit of cost without a price."""

@@ -1,6 +1,7 @@
 """What came of a run, and what to do next with it, as commands to paste."""
 
 import contextlib
+import math
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -144,9 +145,33 @@ def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         steps.append((f"{resume} stopping=none", "continue it until its budget is used"))
     elif limit in spent:  # else the rest of an experiment's budget decides
         budget = {key: most for key, most in config["budget"].items() if key in spent and most is not None}
-        again = [f"budget.{key}={_twice(spent[key])}" for key, most in budget.items() if spent[key] >= most]
-        steps.append((" ".join([resume, *again]), "continue it for as long again"))
+        again = {key: (most, _twice(spent[key])) for key, most in budget.items() if spent[key] >= most}
+        words = [f"budget.{key}={twice}" for key, (_, twice) in again.items()]
+        what = "continue it for as long again"
+        if held := _rates_that_follow(config):
+            # Where the schedules were when the limits were reached, whatever was used until the run had ended.
+            until = config["budget"].get("schedule_until", 1.0)
+            words.append(schedule_until(until * min(most / float(twice) for most, twice in again.values())))
+            what += f", {' and '.join(held)} as at its end"
+        steps.append((" ".join([resume, *words]), what))
     return steps
+
+
+def schedule_until(share: float) -> str:
+    """Return the override that lets the schedules end at a share of the budget, rounded down to be at it by then."""
+    scale = 10 ** (3 - math.floor(math.log10(share)))
+    return f"budget.schedule_until={math.floor(share * scale) / scale:g}"
+
+
+def _rates_that_follow(config: Mapping[str, Any]) -> list[str]:
+    """Return names of what the share of the budget decides in a run of ours."""
+    names = []
+    schedule, algorithm = config.get("lr_schedule") or {}, config.get("algorithm") or {}
+    if schedule.get("kind") != "constant" and schedule.get("by", "fraction") == "fraction":
+        names.append("learning rate")
+    if algorithm.get("entropy_end_factor", 1.0) != 1.0 and algorithm.get("entropy_coeff"):
+        names.append("entropy bonus")
+    return names
 
 
 def _twice(spent: float) -> str:

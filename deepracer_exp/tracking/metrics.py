@@ -64,7 +64,7 @@ METRICS: Mapping[str, tuple[str, str]] = {
     "env_steps_per_s": ("time/env_steps_per_s", "control steps per second of wall time"),
     "collect_s": ("time/collect_s", "seconds of collection in this iteration"),
     "update_s": ("time/update_s", "seconds of updates in this iteration"),
-    "wall_clock_s": ("time/wall_clock_s", "seconds since the start of the run"),
+    "wall_clock_s": ("time/wall_clock_s", "seconds since the first step"),
     "cpu_percent": (
         "system/cpu_utilization_percentage",
         "use of all cores of the machine since the last row",

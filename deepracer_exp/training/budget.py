@@ -71,6 +71,11 @@ class Budget:
             shares.append((limit, own_use / (most - others) if most > others else 1.0))
         return max(shares, key=lambda share: share[1])
 
+    def scheduled(self, env_steps: int, iterations: int, wall_clock_s: float) -> float:
+        """Return where the schedules that follow the budget are, 0 to 1, their end; arguments as of `used`."""
+        _, share = self.used(env_steps, iterations, wall_clock_s)
+        return min(share / self._config.schedule_until, 1.0)
+
     def alerts(self, env_steps: int, iterations: int, wall_clock_s: float) -> list[Alert]:
         """Return what was passed since the last call, at most one alert a limit; the first call sets the start."""
         first, passed = not self._alerted, []

@@ -3,6 +3,7 @@
 import ast
 import json
 import logging
+import math
 import shutil
 import time
 import traceback
@@ -22,9 +23,12 @@ from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.learning import PPOConfig, SACConfig
 from deepracer_exp.config.own_class import own_classes
+from deepracer_exp.config.parse import parse_config
+from deepracer_exp.config.running import BudgetConfig
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.errors import NO_MEMORY, BadInput, RunFailed, count, is_refused_memory, reading
 from deepracer_exp.lookup.kept import keep_policy
+from deepracer_exp.lookup.next_steps import schedule_until
 from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.lookup.rival import kept_rival
 from deepracer_exp.rewards.reward import RewardFunction
@@ -53,13 +57,14 @@ from deepracer_exp.tracking.metadata import joined, lineage_tags, run_params, ru
 from deepracer_exp.tracking.metrics import now_ms
 from deepracer_exp.tracking.tracking_file import TrackedRun, begin_again, read_tracked_run
 
-from .budget import refuse_spent
+from .budget import Budget, refuse_spent
 from .callback import Callback, TakenOver, TrainResult
 from .callbacks import standard_callbacks
 from .clone import describe_clone, read_parent
 from .machine import memory_needed
 from .metrics import track_names
 from .plan import ResumePlan, TrainPlan
+from .rounding import rounded
 from .signals import Interruption
 from .teacher import check_teacher
 from .trainer import Trainer
@@ -103,7 +108,7 @@ def run_training(
         setup = try_out(plan)
         memory = memory_needed(plan.experiment)
         trainer = _begin(plan, setup, console, start, callbacks, run_name, tags, created)
-        _print_memory(memory, console)
+        _print_lines([*rounded(plan.experiment), *memory], console)
         return _run(trainer, interruption)
 
 
@@ -313,7 +318,9 @@ def _reopen(
     where = f"resumes after iteration {iteration}" if iteration else "had no checkpoint yet: begins again"
     logger.info(where)
     _printing(console)(f"{run_dir.name}: {where}")
-    _print_memory(memory, console)
+    _print_lines([*rounded(experiment), *memory], console)
+    if (moved := _moved_schedules(trainer, plan)) is not None:
+        logger.warning(moved)
     for why in _differences_to_uninterrupted(experiment, setup):
         logger.warning("the result will not be that of an uninterrupted run: %s", why)
     return trainer
@@ -333,8 +340,30 @@ def _forget_damaged_best(run_dir: Path, state: dict[str, Any]) -> None:
         state["best"] = None
 
 
-def _print_memory(memory: Sequence[str], console: Console) -> None:
-    for line in memory:
+def _moved_schedules(trainer: Trainer, plan: ResumePlan) -> str | None:
+    """Return a line on rates that another budget changes at once, and on what holds them; None: there are none."""
+    before, now = parse_config(dict(plan.stored["budget"]), BudgetConfig), plan.experiment.budget
+    budgets = [Budget(config, plan.run_dir) for config in (before, now)]
+    old, new = (
+        trainer.agent.rates(trainer.iteration, budget.scheduled(*trainer.usage)) for budget in budgets
+    )
+    moved = [
+        f"{name} goes from {old[name]:.2g} to {new[name]:.2g}"
+        for name in old
+        if not math.isclose(old[name], new[name], rel_tol=0.01, abs_tol=1e-12)
+    ]
+    if not moved:
+        return None
+    (_, used_before), (limit, used_now) = (budget.used(*trainer.usage) for budget in budgets)
+    held = schedule_until(before.schedule_until * used_now / used_before)
+    return (
+        f"budget.{limit}={getattr(now, limit):g}: with this budget the {' and the '.join(moved)}; add {held} to hold "
+        "the schedule of the run"
+    )
+
+
+def _print_lines(lines: Sequence[str], console: Console) -> None:
+    for line in lines:
         logger.info(line)
         _printing(console)(line)
 

@@ -147,7 +147,9 @@ class Trainer:
         self._fingerprint = fingerprint(config, setup)
         self._cars: dict[str, Any] | None = None
         self._first_lap: dict[str, float] | None = None
-        self._began = self._saved_at = time.monotonic()
+        self._spent_s = 0.0
+        self._began_at: float | None = None
+        self._saved_at = time.monotonic()
         # A racer counts from the start of the command, not of the loop.
         self._process_began = psutil.Process().create_time()
         folder.open_log()
@@ -165,6 +167,7 @@ class Trainer:
         self._interruption = interruption
         with self.running:
             collector = self._start()
+            self._began_at = self._saved_at = time.monotonic()
             while collector is not None and self.ending is None:
                 interruption.may_leave_out = self.saved_steps == self.env_steps
 
@@ -280,7 +283,7 @@ class Trainer:
         self.saved_steps = self.env_steps
         self.metrics.load_state_dict(state["results"])
         self._first_lap, self._cars = state["first_lap"], state["cars"]
-        self._began -= state["wall_clock_s"]
+        self._spent_s = state["wall_clock_s"]
         self._process_began -= state["wall_clock_s"]
         for callback in self.callbacks:
             callback.load_state_dict(state)
@@ -343,8 +346,8 @@ class Trainer:
 
     @property
     def wall_clock_s(self) -> float:
-        """Seconds of training, those before a resume included."""
-        return time.monotonic() - self._began
+        """Seconds since the cars were ready for the first step, those before a resume included."""
+        return self._spent_s + (0.0 if self._began_at is None else time.monotonic() - self._began_at)
 
     @property
     def usage(self) -> tuple[int, int, float]:
@@ -405,10 +408,10 @@ class Trainer:
             getattr(callback, hook)(self, *arguments)
 
     def _update(self, batch: TensorDictBase) -> UpdateMetrics:
-        _, fraction = self.budget.used(*self.usage)
+        fraction = self.budget.scheduled(*self.usage)
         torch.set_num_threads(self._update_threads)
         try:
-            return self.agent.update(batch, self.iteration, min(fraction, 1.0))
+            return self.agent.update(batch, self.iteration, fraction)
         except RunFailed as error:
             error.arrays = {  # type: ignore[attr-defined]
                 "observation": batch["observation"].numpy(),

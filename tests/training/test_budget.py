@@ -11,7 +11,7 @@ from deepracer_exp.tracking.metrics import TRACK_METRICS
 from deepracer_exp.training import budget as module
 from deepracer_exp.training.budget import Budget, RunEnded, refuse_ended, refuse_spent
 
-NONE = {field.name: None for field in dataclasses.fields(BudgetConfig)}
+NONE = {field.name: None for field in dataclasses.fields(BudgetConfig)} | {"schedule_until": 1.0}
 
 
 def limits(**given: Any) -> BudgetConfig:
@@ -53,6 +53,11 @@ def sibling(run: Path, name: str, *, ended: bool = True, **spent: Any) -> None:
 )
 def test_the_limit_nearest_to_its_end_counts_of_those_that_are_set(limit, at, used):
     assert Budget(limits(**limit), Path()).used(*at) == used
+
+
+@pytest.mark.parametrize(("until", "place"), [(1.0, 0.25), (0.5, 0.5), (0.25, 1.0), (0.1, 1.0), (2.0, 0.125)])
+def test_schedules_come_to_their_end_at_a_share_of_the_budget_and_stay_there(until, place):
+    assert Budget(limits(env_steps=1000, schedule_until=until), Path()).scheduled(250, 1, 0.0) == place
 
 
 def test_a_run_costs_the_price_of_its_time():

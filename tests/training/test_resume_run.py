@@ -13,7 +13,7 @@ from mlflow import MlflowClient
 from deepracer_exp.agents.ppo import PPO
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.lookup.resolve import resolve
-from deepracer_exp.runs.checkpoints import check, checkpoint_name, read_checkpoint
+from deepracer_exp.runs.checkpoints import check, checkpoint_name, read_checkpoint, read_training
 from deepracer_exp.runs.files import read_metrics, read_object
 from deepracer_exp.runs.folder import RunFolder
 from deepracer_exp.training import signals
@@ -88,6 +88,51 @@ def test_a_run_that_continues_is_the_run_that_was_never_interrupted(trained, cut
     assert_same_run(run, whole(trained, *overrides))
     assert summary(run)["iteration"] == 6
     assert "will not be that of an uninterrupted run" not in ended.stderr
+
+
+SCHEDULED = ("lr_schedule=linear", "algorithm.entropy_end_factor=0.1")
+
+
+def test_a_larger_budget_that_moves_the_schedules_says_so_and_how_they_are_held(cut, call):
+    run = cut(*SCHEDULED)
+    last = rows(run)[-1]["lr"]
+    ended = call("resume", run.name, "budget.iterations=6")
+    assert ended.code == 0, ended.stderr
+    (line,) = (line for line in ended.stderr.splitlines() if "budget.schedule_until" in line)
+    assert line == (
+        "warning: budget.iterations=6: with this budget the learning rate goes from 0.00013 to 0.00072 and the "
+        "entropy bonus goes from 0.001 to 0.0055; add budget.schedule_until=0.5 to hold the schedule of the run"
+    )
+    assert rows(run)[3]["lr"] == pytest.approx(0.55 * 1.3e-3) > last
+
+
+def test_a_run_whose_schedules_are_held_is_one_that_was_never_interrupted(trained, cut, call):
+    held = "budget.schedule_until=0.5"
+    run = cut(*SCHEDULED)
+    ended = call("resume", run.name, "budget.iterations=6", held)
+    assert ended.code == 0, ended.stderr
+    assert "the learning rate goes" not in ended.stderr
+    assert_same_run(run, whole(trained, *SCHEDULED, held))
+    assert [row["lr"] for row in rows(run)[3:]] == pytest.approx([1.3e-4] * 3)
+
+
+def test_the_clock_begins_with_the_first_step_and_goes_on_where_it_stopped(cut, call, monkeypatch):
+    seen = []
+
+    class Watched(Trainer):
+        def _start(self):
+            before = self.wall_clock_s
+            collector = super()._start()
+            seen.append((before, self.wall_clock_s))
+            return collector
+
+    run = cut()
+    stored = read_training(check(run / "checkpoints" / "last"))["wall_clock_s"]
+    monkeypatch.setattr("deepracer_exp.training.run.Trainer", Watched)
+    ended = call("resume", run.name, "budget.iterations=4")
+    assert ended.code == 0, ended.stderr
+    assert seen == [(stored, stored)]
+    assert rows(run)[-1]["wall_clock_s"] > stored
 
 
 def test_a_copy_without_links_continues_as_the_run_itself(trained, cut, call):

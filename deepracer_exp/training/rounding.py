@@ -1,0 +1,38 @@
+"""What an iteration does where its steps, cars and minibatches do not divide."""
+
+from deepracer_exp.collectors.base import steps_per_batch
+from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.learning import PPOConfig
+
+
+def rounded(experiment: Experiment) -> list[str]:
+    """Return a line for each value of the algorithm that a training does not use as it was given: key, value, actual.
+
+    Of iterations that are counted in episodes nothing is known in advance.
+    """
+    algorithm, cars = experiment.algorithm, experiment.collector.cars
+    asked = algorithm.frames_per_iteration
+    if asked is None:
+        return []
+    lines, each = [], steps_per_batch(experiment.collector, asked)
+    frames = each * cars
+    if frames != asked:
+        lines.append(
+            f"algorithm.frames_per_iteration={asked}: each iteration has {frames:,} steps, {each:,} of each of "
+            f"{cars:,} cars"
+        )
+    # Soft actor-critic draws its minibatches from a replay, and a class of the user's own may do anything.
+    if not isinstance(algorithm, PPOConfig) or algorithm.target is not None:
+        return lines
+    sizes = {"batch_size": algorithm.batch_size}
+    if algorithm.teacher_iterations:
+        sizes["teacher_batch_size"] = algorithm.teacher_batch_size
+    for key, size in sizes.items():
+        if size > frames:
+            lines.append(f"algorithm.{key}={size}: a minibatch has {frames:,} steps, all of an iteration")
+        elif left_out := frames % size:
+            lines.append(
+                f"algorithm.{key}={size}: each pass leaves out {left_out:,} of an iteration's {frames:,} steps, "
+                "others each time"
+            )
+    return lines
