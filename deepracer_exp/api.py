@@ -134,7 +134,7 @@ def load_policy(
 
     Args:
         run: as for `evaluate`.
-        checkpoint: `best`, `last` or the number of an iteration; None: the best, or that of the alias.
+        checkpoint: `best`, `last`, `fastest` or the number of an iteration; None: the best, or that of the alias.
         runs_dir: where to look for runs.
 
     Raises:

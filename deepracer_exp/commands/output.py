@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.runs.files import BEST_LAP, CHECKPOINTS, LEARNING, METRICS, REPORT, full_name, read_metrics
-from deepracer_exp.runs.result import FAILED, RELIABLE, fastest_reliable
+from deepracer_exp.runs.result import FAILED, RELIABLE, fastest_reliable, why_not_fastest
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -121,6 +121,8 @@ def print_result(outcome: "TrainResult", tracking: "TrackingConfig") -> None:
         several = ", mean of the laps on all tracks" * ("tracks" in summary)
         print(f"\n  fastest reliable lap: {_reliable_lap(outcome.folder)}{several}")
         print(f"  best checkpoint by {result.criterion}: {result.iteration:06d}, {result.words()}")
+        if (why := why_not_fastest(result, read_metrics(outcome.folder / METRICS))) is not None:
+            print(f"    {why}")
     print(f"\n  results       {outcome.folder}")
     for name, what in _FILES.items():
         if (outcome.folder / name).exists():
@@ -142,7 +144,7 @@ def _reliable_lap(run: Path) -> str:
         share = max((row.get("eval_lap_share") or 0.0 for row in rows), default=0.0)
         return f"none yet; {RELIABLE:.0%} of the usual laps must be complete, at best {share:.0%} were"
     kept = (run / CHECKPOINTS / f"{lap.iteration:06d}").is_dir()
-    return f"{lap}" if kept else f"{lap} (not kept; checkpoints.metric=reliable_lap keeps it)"
+    return f"{lap}" if kept else f"{lap} (not kept)"
 
 
 def print_steps(steps: Sequence[tuple[str, str]]) -> None:

@@ -96,7 +96,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         description="Register a checkpoint as a version of a model in MLflow and give it an alias, by which evaluate, "
         "export and clone find it. From then on nothing removes it from the run's folder.",
     )
-    add_run(promote, f"checkpoint=best|last|N | {where}")
+    add_run(promote, f"checkpoint=best|last|fastest|N | {where}")
     promote.add_argument("--model", help="name of the model (default: the experiment's)")
     promote.add_argument(
         "--alias",

@@ -12,6 +12,7 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.lookup.best import best_of
 from deepracer_exp.runs.files import (
     BEST,
+    CHECKPOINTS,
     METRICS,
     RunRecord,
     full_name,
@@ -125,6 +126,9 @@ def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
             film,
             (command_line("clone", word, config), "train it further, at a tenth of the learning rate"),
         ]
+        best, fastest = ((run / CHECKPOINTS / label).resolve() for label in ("best", "fastest"))
+        if fastest.is_dir() and fastest != best:
+            steps.insert(1, (f"{evaluate} checkpoint=fastest", "race the fastest reliable checkpoint"))
         if config["evaluation"].get("real_car"):
             steps[0] = (
                 f"{evaluate} evaluation=real_car",

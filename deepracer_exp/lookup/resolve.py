@@ -12,7 +12,6 @@ from deepracer_exp.config.own_class import OF_POLICY
 from deepracer_exp.config.parse import import_own_classes, parse_experiment
 from deepracer_exp.errors import BadInput, nearest, reading
 from deepracer_exp.runs.checkpoint_files import (
-    LINKS,
     checkpoint_sha256,
     find_checkpoint,
     restore_links,
@@ -47,7 +46,7 @@ class StoredRun:
 
     path: Path
     checkpoint: str | None = None
-    """Name of the checkpoint that is meant: `best`, `last` or an iteration; None: not chosen."""
+    """Name of the checkpoint that is meant: `best`, `last`, `fastest` or an iteration; None: not chosen."""
     was_never_evaluated: bool = False
     """Whether the checkpoint is `last` only because the run ended before it had a best one."""
     registered: str | None = None
@@ -76,14 +75,14 @@ class StoredRun:
     def with_checkpoint(self, name: str | None = None) -> "StoredRun":
         """Return the run with the checkpoint to use.
 
-        `name` is `best`, `last` or an iteration; None: the alias's, or the best. A run that ended before its first
-        evaluation has no best: its last is used, with a warning when it is read.
+        `name` is `best`, `last`, `fastest` or an iteration; None: the alias's, or the best. A run that ended before its
+        first evaluation has no best: its last is used, with a warning when it is read.
 
         Raises:
             BadInput: there is no such checkpoint.
         """
         folder, name = self.checkpoints, name or self.checkpoint
-        best, last = (folder / link for link in LINKS)
+        best, last = folder / "best", folder / "last"
         only_last = name is None and not (best.is_symlink() or best.exists()) and last.exists()
         name = "last" if only_last else name or "best"
         find_checkpoint(folder, name)

@@ -77,7 +77,7 @@ class CheckpointResult:
 
     name: str
     labels: tuple[str, ...]
-    """`best` and `last`, if it is."""
+    """`best`, `last` and `fastest`, if it is."""
     pinned: tuple[str, ...]
     """Reasons why it must not be removed."""
     env_steps: int | None

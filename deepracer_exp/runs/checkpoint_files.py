@@ -16,7 +16,8 @@ from .files import WRITTEN
 
 HASHES = "hashes.json"
 MANIFEST = "manifest.json"
-LINKS = ("best", "last")
+LINKS = ("best", "last", "fastest")
+"""Names of the best checkpoint, of the last one, and of the one that laps fastest of the reliable ones."""
 _PINNED = "pinned.json"
 _PINS = TypeAdapter(dict[str, list[str]])
 
@@ -44,7 +45,7 @@ def verify(folder: Path) -> None:
 
 
 def restore_links(folder: Path) -> None:
-    """Make `best` and `last` links again where a copy has followed them, or holds them as text.
+    """Make the names of `LINKS` links again where a copy has followed them, or holds them as text.
 
     `cp -rL`, object stores and archives without links turn each into a second copy of its checkpoint. A folder that
     cannot be written stays as it is, and so does a copy that equals no checkpoint of another name.
@@ -75,13 +76,15 @@ def restore_links(folder: Path) -> None:
 def find_checkpoint(folder: Path, name: str) -> Path:
     """Return the folder of a checkpoint, or the link to it; it may be a missing `last` if there are other checkpoints.
 
-    `folder` is `checkpoints/` of a run, `name` is `best`, `last` or the number of an iteration.
+    `folder` is `checkpoints/` of a run, `name` is one of `LINKS` or the number of an iteration.
 
     Raises:
         BadInput: there is no such checkpoint, or it lies elsewhere.
     """
-    if not re.fullmatch(r"best|last|\d{1,9}", name):
-        raise BadInput(f"checkpoint={name}", "a checkpoint is best, last or the number of an iteration")
+    if name not in LINKS and not re.fullmatch(r"\d{1,9}", name):
+        raise BadInput(
+            f"checkpoint={name}", f"a checkpoint is {', '.join(LINKS)} or the number of an iteration"
+        )
     restore_links(folder)
     path = folder / (f"{int(name):06d}" if name.isdecimal() else name)
     kept = kept_checkpoints(folder)

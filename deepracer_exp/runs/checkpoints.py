@@ -42,7 +42,7 @@ class StoredPolicy:
 
 
 def read_checkpoint(experiment: Experiment, folder: Path, name: str) -> StoredPolicy:
-    """Read the networks of a checkpoint, or of the newest intact one if `best` or `last` is corrupt.
+    """Read the networks of a checkpoint, or of the newest intact one if one of `LINKS` is corrupt.
 
     `folder` and `name` as of `find_checkpoint`.
 
@@ -55,7 +55,7 @@ def read_checkpoint(experiment: Experiment, folder: Path, name: str) -> StoredPo
 def intact_checkpoint(folder: Path, name: str, *, resumable: bool = False) -> Path:
     """Return the folder of a checkpoint whose files all match their hashes.
 
-    If `best` or `last` is corrupt, or `last` is missing, the newest intact checkpoint is used, with a warning. With
+    If one of `LINKS` is corrupt, or `last` is missing, the newest intact checkpoint is used, with a warning. With
     `resumable`, it is one that a training can resume from; `folder` and `name` as of `find_checkpoint`.
 
     Raises:
@@ -141,11 +141,11 @@ def read_training(path: Path) -> dict[str, Any]:
 
 
 class CheckpointStore:
-    """`checkpoints/` of a run folder: one directory per kept iteration, and the links `best` and `last`.
+    """`checkpoints/` of a run folder: one directory per kept iteration, and the links of `LINKS`.
 
     A directory is written aside with the hashes of its files and moved into place whole (torchrl.checkpoint: tensors
     and JSON, no pickle); a link changes in one step, and what is older is removed after that. So whenever the run is
-    killed, both names lead to a complete checkpoint.
+    killed, all names lead to a complete checkpoint.
     """
 
     def __init__(self, run_dir: Path, keep: int, every: int | None = None):
@@ -175,11 +175,13 @@ class CheckpointStore:
         training: Mapping[str, Any] | None = None,
         *,
         best: bool = False,
+        fastest: bool = False,
     ) -> None:
         """Save the agent under the number of its iteration.
 
         `training` is the rest of what a resumed training needs: tensors, arrays and JSON types; None: no training can
-        resume from here, and the checkpoint is not `last`. `best`: it is the best so far.
+        resume from here, and the checkpoint is not `last`. `best`: it is the best so far; `fastest`: it laps fastest of
+        the reliable ones.
 
         Raises:
             OSError, RunFailed: the folder cannot be written; what was there before is unchanged.
@@ -190,8 +192,7 @@ class CheckpointStore:
             self._replay.write(replay)
         if not (self.folder / name).exists():  # nothing is learned between two updates
             self._write(name, agent, counters, training)
-        if best:
-            self._link("best", name)
+        self.mark(counters["iteration"], best=best, fastest=fastest)
         if training is not None:
             self._link("last", name)
         self._prune()
@@ -207,20 +208,26 @@ class CheckpointStore:
         if agent.replay is not None:
             self._replay.restore(agent.replay)
 
-    def mark_best(self, iteration: int) -> None:
-        """Let `best` lead to an iteration's checkpoint; the one before stays, for a resumed run, whose best it is."""
-        self._link("best", checkpoint_name(iteration))
+    def mark(self, iteration: int, *, best: bool = False, fastest: bool = False) -> None:
+        """Let `best` and `fastest` lead to an iteration's checkpoint, if it is.
 
-    def rewind(self, iteration: int, best: int | None) -> None:
+        The checkpoints before stay until the next is saved: a resumed run may go back to them.
+        """
+        for label, is_so in (("best", best), ("fastest", fastest)):
+            if is_so:
+                self._link(label, checkpoint_name(iteration))
+
+    def rewind(self, iteration: int, best: int | None, fastest: int | None = None) -> None:
         """Go back to an iteration: `last` is its checkpoint, and what came later goes, unless it must stay.
 
-        `best` is the iteration of the best checkpoint up to there, None if there was none.
+        `best` is the iteration of the best checkpoint up to there, `fastest` that of the one which laps fastest of the
+        reliable ones; None if there was none.
         """
         pins = pinned(self.folder)
         for path in self._numbered():
             if int(path.name) > iteration and path.name not in pins:
                 _remove(path)
-        for label, number in (("last", iteration), ("best", best)):
+        for label, number in (("last", iteration), ("best", best), ("fastest", fastest)):
             if number is not None and (self.folder / checkpoint_name(number)).is_dir():
                 self._link(label, checkpoint_name(number))
             else:

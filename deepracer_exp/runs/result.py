@@ -166,6 +166,22 @@ def fastest_reliable(rows: Iterable[Mapping[str, Any]]) -> ReliableLap | None:
     )
 
 
+def why_not_fastest(result: RunResult, rows: Iterable[Mapping[str, Any]]) -> str | None:
+    """Return why the best checkpoint is another than that of the fastest reliable lap; None where it is not."""
+    by_iteration = {row["iteration"]: row for row in rows}
+    lap = fastest_reliable(by_iteration.values())
+    if lap is None or result.iteration in (None, lap.iteration):
+        return None
+    best, fast = f"{result.iteration:06d}", f"{lap.iteration:06d}"
+    score_s = by_iteration[lap.iteration].get("eval_race_score_s")
+    if result.measure != "race_score" or result.race_score_s is None:
+        return f"{best} ranks above {fast}, which laps faster, by {result.criterion}"
+    score, best_s = result.figure(BOTH), f"{result.race_score_s:.2f} s"
+    if score_s is None:
+        return f"{fast} laps faster, but it has no {score}, that of {best} is {best_s}"
+    return f"{fast} laps faster, but its {score} is {score_s:.2f} s, that of {best} {best_s}"
+
+
 def reliable_lap_s(row: Mapping[str, Any]) -> float | None:
     """Return the mean lap time of a row's evaluation, None if it has none or completed too few of its usual laps."""
     share, lap_time_s = row.get("eval_lap_share"), row.get("eval_lap_time_s")

@@ -139,8 +139,8 @@ def promote(
 ) -> Registered:
     """Register a checkpoint as a version of a model and give it the alias.
 
-    `name` is `best`, `last` or the number of an iteration; `features` and `seen` describe what the policy sees. The
-    alias is taken from the version that has it.
+    `name` is `best`, `last`, `fastest` or the number of an iteration; `features` and `seen` describe what the policy
+    sees. The alias is taken from the version that has it.
 
     The version is a logged model of MLflow: the checkpoint's files, the run's report and picture, a signature, and the
     checkpoint's evaluation as metrics. The checkpoint is pinned in the run's folder. A checkpoint that already is a

@@ -310,7 +310,8 @@ def _reopen(
         for tag, value in UNDECIDED.items():
             tracker.set_tag(tag, value)
     folder.rewind(rows)
-    trainer.checkpoints.rewind(iteration, (state["best"] or {}).get("iteration"))
+    best, fastest = ((row or {}).get("iteration") for row in (state["best"], trainer.fastest))
+    trainer.checkpoints.rewind(iteration, best, fastest)
     folder.write(CONFIG, composition.yaml())
     acting.remember()
     for note in composition.notes:

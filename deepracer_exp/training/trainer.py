@@ -34,7 +34,7 @@ from deepracer_exp.runs.crash_dump import write_crash_dump
 from deepracer_exp.runs.files import SUMMARY, TRACE
 from deepracer_exp.runs.fingerprint import fingerprint
 from deepracer_exp.runs.folder import RunFolder
-from deepracer_exp.runs.result import FAILED, FINISHED, INTERRUPTED, Ending
+from deepracer_exp.runs.result import FAILED, FINISHED, INTERRUPTED, Ending, fastest_reliable
 from deepracer_exp.runs.trace import trace_writer
 from deepracer_exp.sim.batch import cores
 
@@ -71,6 +71,7 @@ class Trainer:
         row: metrics of the last iteration, a line of metrics.jsonl.
         evaluation: of the policy after the last iteration, None if it was not evaluated.
         best: which policy is the best so far.
+        fastest: the row of the policy whose evaluated laps are the fastest of the reliable ones so far, if any.
         saved_steps: env steps of the last checkpoint from which the run can be resumed, 0 before there is one.
         running: the contexts of the loop, its cars among them.
         ending: how the run ends, None while it continues.
@@ -139,6 +140,7 @@ class Trainer:
         self.row: dict[str, Any] = {}
         self.evaluation: Evaluation | None = None
         self.best = BestPolicy(experiment, setup)
+        self.fastest: dict[str, Any] | None = None
         self.saved_steps = 0
         self.running = contextlib.ExitStack()
         self.ending: Ending | None = None
@@ -194,6 +196,7 @@ class Trainer:
                 # 4. Callbacks: evaluate, stop?, prune?, budget?, record, track, display.
                 self._call("on_iteration_end")
                 is_best = self.best.evaluated_best(self.evaluation, self.counters())
+                is_fastest = self._laps_fastest()
                 self._write_trace(rows)
                 self._check_interruption()
                 # After the evaluation, which thus raced against those that the policy has learned to beat.
@@ -206,14 +209,14 @@ class Trainer:
                     self.iteration % _LAST_EVERY == 0 or time.monotonic() > self._saved_at + _LAST_EVERY_S
                 )
                 if self.ending or self._save_requested or is_due:
-                    self.save(collector, is_best)
+                    self.save(collector, best=is_best, fastest=is_fastest)
         assert self.ending is not None
         hurry = any(callback.hurries_when_interrupted for callback in self.callbacks)
         if interruption.signum is None or not hurry:
             self.evaluation = None
             self._call("on_train_end")
-            if self.best.evaluated_best(self.evaluation, self.counters()):
-                self.checkpoints.mark_best(self.iteration)
+            is_best = self.best.evaluated_best(self.evaluation, self.counters())
+            self.checkpoints.mark(self.iteration, best=is_best, fastest=self._laps_fastest())
         return self.ending
 
     def request_stop(self, reason: str | Ending, status: str = FINISHED) -> None:
@@ -223,6 +226,14 @@ class Trainer:
         """
         if self.ending is None:
             self.ending = reason if isinstance(reason, Ending) else Ending(status, reason)
+
+    def _laps_fastest(self) -> bool:
+        """Return whether the row's evaluation has the fastest reliable lap so far, and remember it."""
+        lap = fastest_reliable([row for row in (self.fastest, self.row) if row])
+        if lap is None or lap.iteration != self.row["iteration"]:
+            return False
+        self.fastest = self.row
+        return True
 
     def _write_trace(self, rows: NDArray[np.float64]) -> None:
         """Write the steps of an iteration, and where the others around them were."""
@@ -236,13 +247,14 @@ class Trainer:
         """Write a checkpoint after this iteration."""
         self._save_requested = True
 
-    def save(self, collector: Collector | None = None, best: bool = False) -> None:
+    def save(self, collector: Collector | None = None, *, best: bool = False, fastest: bool = False) -> None:
         """Write a checkpoint from which the run can be resumed.
 
         Args:
             collector: whose cars are stored; None: before the first iteration, so that a run which is killed before
                 its first checkpoint can begin again.
             best: whether the checkpoint becomes `best`.
+            fastest: whether it becomes `fastest`.
 
         Raises:
             RunFailed: the disk is full, or a worker was lost.
@@ -264,7 +276,7 @@ class Trainer:
         state |= self.best.state_dict()
         if self._trace is not None:
             self._trace.flush()
-        self.checkpoints.save(self.agent, self.counters(), state, best=best)
+        self.checkpoints.save(self.agent, self.counters(), state, best=best, fastest=fastest)
         if collector is not None:
             self.saved_steps = self.env_steps
             self._saved_at = time.monotonic()
@@ -300,6 +312,7 @@ class Trainer:
             self.ending = None  # the last row decides
             self.row = dict(row)
             self._call("on_replay")
+            self._laps_fastest()
             replayed.append(self.row)
         return replayed
 

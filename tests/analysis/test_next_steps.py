@@ -50,6 +50,43 @@ def test_a_policy_for_the_car_is_raced_as_the_car_and_exported(runs):
 
 
 @pytest.mark.parametrize(
+    ("lr_schedule", "algorithm", "held"),
+    [
+        ({"kind": "constant", "by": "fraction"}, {"entropy_end_factor": 1.0}, None),
+        ({"kind": "linear", "by": "iteration"}, {"entropy_end_factor": 1.0}, None),
+        ({"kind": "linear", "by": "fraction"}, {"entropy_end_factor": 1.0}, "learning rate"),
+        ({"kind": "constant", "by": "fraction"}, {"entropy_end_factor": 0.0}, "entropy bonus"),
+        ({"target": "my:Own"}, {"entropy_end_factor": 0.0}, "learning rate and entropy bonus"),
+    ],
+)
+def test_as_long_again_holds_what_follows_the_budget(runs, lr_schedule, algorithm, held):
+    run = runs[0]
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    config |= {"lr_schedule": lr_schedule, "algorithm": config["algorithm"] | algorithm}
+    config["budget"]["env_steps"] = 1000
+    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    spent = {"status": "finished", "limit": "env_steps", "env_steps": 1024}
+    line, what = next_steps(run, {**read_object(run / "summary.json"), **spent})[-1]
+    words = [word for word in shlex.split(line) if word.startswith("budget.")]
+    assert words[0] == "budget.env_steps=2048"
+    # 1,000 of 2,048, rounded down: the schedule had come to its end by then.
+    assert words[1:] == ([] if held is None else ["budget.schedule_until=0.4882"])
+    assert what == "continue it for as long again" + (f", {held} as at its end" if held else "")
+
+
+def test_the_fastest_reliable_checkpoint_is_a_command_away_where_it_is_not_the_best(runs):
+    run = runs[1]
+    summary = read_object(run / "summary.json")
+    link = run / "checkpoints" / "fastest"
+    for target, offered in (("best", False), ("000000", True)):
+        (run / "checkpoints" / "000000").mkdir(exist_ok=True)
+        link.unlink(missing_ok=True)
+        link.symlink_to(target)
+        lines = [line for line, _ in next_steps(run, summary)]
+        assert (f"deepracer-exp evaluate {run_word(run)} checkpoint=fastest" in lines) is offered
+
+
+@pytest.mark.parametrize(
     ("limit", "spent_s", "more"),
     [(1.5, 90.4, "3"), (0.5, 30.9, "1"), (10.0, 603.0, "20"), (0.05, 3.4, "0.11"), (120, 7201.0, "240")],
 )

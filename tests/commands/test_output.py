@@ -56,7 +56,7 @@ def rows_of(*laps: tuple[int, float | None, int]) -> str:
         (
             rows_of((30, 6.5, 8), (40, 6.72, 8)),
             "000040",
-            "checkpoint 30, 6.50 s, 8 of 8 (not kept; checkpoints.metric=reliable_lap keeps it)",
+            "checkpoint 30, 6.50 s, 8 of 8 (not kept)",
         ),
         (
             rows_of((30, 6.5, 5), (40, 6.72, 7)),

@@ -13,7 +13,7 @@ from torchrl.checkpoint import Checkpoint
 import deepracer_exp
 from deepracer_exp.agents.ppo import PPO
 from deepracer_exp.errors import BadInput, RunFailed
-from deepracer_exp.runs.checkpoint_files import pin, verify
+from deepracer_exp.runs.checkpoint_files import find_checkpoint, pin, verify
 from deepracer_exp.runs.checkpoints import CheckpointStore, read_training
 
 from .agents import make_agent
@@ -76,6 +76,18 @@ def test_the_best_the_last_and_the_newest_that_were_evaluated_are_kept(tmp_path,
     for iteration in range(6):
         store.save(make_agent(iteration), {"iteration": iteration}, TRAINING, best=iteration == 2)
     assert names(store) == [*(f"{number:06d}" for number in kept), "best", "last"]
+
+
+def test_the_fastest_reliable_checkpoint_is_kept_and_has_a_name(store):
+    for iteration in range(1, 6):
+        said = {"best": iteration == 3, "fastest": iteration in (1, 2)}
+        store.save(make_agent(iteration), {"iteration": iteration}, TRAINING, **said)
+    assert names(store) == ["000002", "000003", "000005", "best", "fastest", "last"]
+    assert find_checkpoint(store.folder, "fastest").resolve().name == "000002"
+    store.rewind(5, 3, 2)
+    assert names(store) == ["000002", "000003", "000005", "best", "fastest", "last"]
+    store.rewind(5, 3)
+    assert not (store.folder / "fastest").is_symlink()
 
 
 def test_a_pinned_checkpoint_is_kept(store):

@@ -4,7 +4,7 @@ from dataclasses import asdict
 
 import pytest
 
-from deepracer_exp.runs.result import Ending, fastest_reliable, result_of
+from deepracer_exp.runs.result import Ending, fastest_reliable, result_of, why_not_fastest
 
 
 @pytest.mark.parametrize(
@@ -78,3 +78,26 @@ BEST |= {"eval_completion": 100.0, "eval_lap_time_s": 7.97, "eval_lap_share": 1.
 )
 def test_figures_name_conditions_and_exploration(summary, words):
     assert result_of(summary).words() == words
+
+
+def test_why_another_checkpoint_than_the_fastest_is_the_best_is_said():
+    def evaluated(iteration: int, lap_s: float, score_s: float | None) -> dict:
+        laps = {"eval_lap_share": 1.0, "eval_laps": 8, "eval_laps_tried": 8, "eval_lap_time_s": lap_s}
+        return {"iteration": iteration, "eval_race_score_s": score_s, **laps}
+
+    def why(rows: list[dict], metric: str = "race_score") -> str | None:
+        best = {"iteration": 40, "metric": metric, "rank": [1.0, -5.6], "eval_completion": 100.0}
+        best |= {"eval_lap_time_s": 5.37, "eval_race_score_s": 5.6, "held_out_completion": 90.0}
+        return why_not_fastest(result_of({"best": best}), rows)
+
+    best = evaluated(40, 5.37, 5.6)
+    assert why([evaluated(30, 5.4, 5.7), best]) is None
+    assert why([evaluated(30, 5.23, 6.02), best]) == (
+        "000030 laps faster, but its race score (usual and held-out) is 6.02 s, that of 000040 5.60 s"
+    )
+    assert why([evaluated(30, 5.23, None), best]) == (
+        "000030 laps faster, but it has no race score (usual and held-out), that of 000040 is 5.60 s"
+    )
+    assert why([evaluated(30, 5.23, 6.02), best], "progress") == (
+        "000040 ranks above 000030, which laps faster, by completion (usual and held-out)"
+    )

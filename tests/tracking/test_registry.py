@@ -90,7 +90,7 @@ TRACKING = "tracking.json"
         (None, TRACKING, json.dumps({"run_id": "0" * 32}), "not found"),
         (None, None, None, "was deleted in MLflow"),
         ("checkpoint=77", None, None, "000077 is not there"),
-        ("checkpoint=../x", None, None, "best, last or the number"),
+        ("checkpoint=../x", None, None, "best, last, fastest or the number"),
         ("tracking.uri=ftp://x", None, None, "tracking.uri=ftp://x"),
     ],
 )

@@ -5,9 +5,10 @@ import json
 import pytest
 
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.files import read_metrics
 from deepracer_exp.runs.folder import RunFolder, is_held
-from deepracer_exp.runs.result import STOPPED_EARLY
+from deepracer_exp.runs.result import STOPPED_EARLY, fastest_reliable
 from deepracer_exp.training.callback import Callback, TakenOver
 from deepracer_exp.training.plan import plan_resume, plan_training
 from deepracer_exp.training.run import copy_run, run_training
@@ -47,6 +48,30 @@ def test_a_run_that_a_callback_stops_early_keeps_a_best_policy(tmp_path):
     rows = read_metrics(outcome.folder / "metrics.jsonl")
     assert [row["eval_completion"] is not None for row in rows] == [False, True, True]
     assert (outcome.folder / "checkpoints" / "best").exists()
+
+
+class MadeUpLaps(Callback):
+    """Replaces the evaluated laps of each iteration by reliable ones of made-up times."""
+
+    times_s = (7.0, 5.0, 6.0, 6.5)
+
+    def on_iteration_end(self, trainer):
+        laps = {"eval_lap_share": 1.0, "eval_laps": 8, "eval_laps_tried": 8}
+        trainer.row |= laps | {"eval_lap_time_s": self.times_s[trainer.iteration - 1]}
+
+
+def test_the_fastest_reliable_checkpoint_is_kept_whatever_is_the_best(tmp_path):
+    often = ("checkpoints.every=1", "checkpoints.keep=1", "evaluation.time_s=4", "budget.env_steps=3072")
+    outcome = run(tmp_path, MadeUpLaps(), *often)
+    link = outcome.folder / "checkpoints" / "fastest"
+    assert link.readlink().name == "000002"
+    plan = plan_resume(outcome.folder, ["budget.env_steps=4096"])
+    assert run_training(plan, callbacks=[MadeUpLaps()]).status == "finished"
+    assert link.readlink().name == "000002"
+    lap = fastest_reliable(read_metrics(outcome.folder / "metrics.jsonl"))
+    assert str(lap) == "checkpoint 2, 5.00 s, 8 of 8"
+    chosen = StoredRun(outcome.folder).with_policy("fastest").read_policy()
+    assert chosen.counters["iteration"] == lap.iteration
 
 
 def test_nothing_is_written_of_a_run_once_it_was_taken_over(tmp_path):

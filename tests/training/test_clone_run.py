@@ -118,7 +118,7 @@ def test_a_rate_that_is_given_is_taken(parent, call, override, lr):
         (["observation.lookahead_m=[1.0]"], ["observation", "features"]),
         (["experiment=tiny"], ["experiment=tiny", "give the groups"]),
         (["checkpoint=77"], ["checkpoint=77", "not there"]),
-        (["checkpoint=../../x"], ["a checkpoint is best, last or the number"]),
+        (["checkpoint=../../x"], ["a checkpoint is best, last, fastest or the number"]),
         (["algorithm.rate=1"], ["algorithm.rate: no such key"]),
     ],
 )
