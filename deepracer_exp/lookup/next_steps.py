@@ -28,6 +28,7 @@ from deepracer_exp.runs.result import (
     Ending,
     fastest_reliable,
     read_result,
+    why_not_fastest,
 )
 from deepracer_exp.tracks.boards import standings, what_it_sees
 
@@ -69,6 +70,8 @@ def outcome(run: RunRecord) -> list[tuple[str, str]]:
                 facts.insert(2, ("Usual laps without a crash, %", f"{100 * crash_free[0]:.0f}"))
             if (lap := fastest_reliable(rows)) is not None:
                 facts.append(("Fastest reliable lap", str(lap)))
+            if (why := why_not_fastest(result, rows)) is not None:
+                facts.append(("Why it is not the best", why))
     elif run.summary:
         facts.append(("Evaluated", "never"))
     return [*facts, ("State", state(run))]

@@ -11,14 +11,14 @@ def rounded(experiment: Experiment) -> list[str]:
     Of iterations that are counted in episodes nothing is known in advance.
     """
     algorithm, cars = experiment.algorithm, experiment.collector.cars
-    asked = algorithm.frames_per_iteration
-    if asked is None:
+    wanted = algorithm.frames_per_iteration
+    if wanted is None:
         return []
-    lines, each = [], steps_per_batch(experiment.collector, asked)
+    lines, each = [], steps_per_batch(experiment.collector, wanted)
     frames = each * cars
-    if frames != asked:
+    if frames != wanted:
         lines.append(
-            f"algorithm.frames_per_iteration={asked}: each iteration has {frames:,} steps, {each:,} of each of "
+            f"algorithm.frames_per_iteration={wanted}: each iteration has {frames:,} steps, {each:,} of each of "
             f"{cars:,} cars"
         )
     # Soft actor-critic draws its minibatches from a replay, and a class of the user's own may do anything.
