@@ -145,6 +145,9 @@ class _StateKeepingEnv(RaceEnv):
         """Return what a batch holds of a step: `trace` under `next` alone, where the training reads it."""
         return super().fake_tensordict().exclude("trace")
 
+    def _reset(self, tensordict: TensorDictBase | None, **options: object) -> TensorDictBase:
+        return super()._reset(tensordict, **options).exclude("trace")
+
     def take_state(self) -> dict[str, Any]:
         """Return the state of the cars, and how many actions each has drawn numbers for."""
         return {"race": self.race.state_dict(), "drawn": self._noise.steps}

@@ -159,7 +159,7 @@ def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
             # Where the schedules were when the limits were reached, whatever was used until the run had ended.
             until = config["budget"].get("schedule_until", 1.0)
             words.append(schedule_until(until * min(most / float(twice) for most, twice in again.values())))
-            what += f", {' and '.join(held)} as at its end"
+            what += f", holding {' and '.join(held)}"
         steps.append((" ".join([resume, *words]), what))
     return steps
 

@@ -71,7 +71,7 @@ def test_as_long_again_holds_what_follows_the_budget(runs, lr_schedule, algorith
     assert words[0] == "budget.env_steps=2048"
     # 1,000 of 2,048, rounded down: the schedule had come to its end by then.
     assert words[1:] == ([] if held is None else ["budget.schedule_until=0.4882"])
-    assert what == "continue it for as long again" + (f", {held} as at its end" if held else "")
+    assert what == "continue it for as long again" + (f", holding {held}" if held else "")
 
 
 def test_the_fastest_reliable_checkpoint_is_a_command_away_where_it_is_not_the_best(runs):
