@@ -1,0 +1,113 @@
+"""How long to wait for processes: until they hang, however busy the machine is.
+
+A limit by the clock alone ends processes that are well: where a dozen others want the same cores, a start of 25 s takes
+minutes. So a process is granted seconds of its CPU while it computes, and seconds of the clock only while it does not.
+"""
+
+import os
+import time
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+
+import psutil
+
+LOOK_EVERY_S = 0.5
+_IDLE_SHARE = 0.01
+"""Share of a core up to which a process does nothing: threads that hang look around now and then."""
+
+
+@dataclass(frozen=True)
+class Use:
+    """What processes have used of the machine, at one moment."""
+
+    cpu_s: float
+    """CPU time of all of them since they began."""
+    is_ready: bool
+    """Whether one of them computes now, or would if it had a core."""
+
+
+def use_of(*pids: int) -> Use:
+    """Return what these processes and all that they have started use; those that are gone use nothing."""
+    cpu_s, is_ready = 0.0, False
+    for process in _with_children(pids):
+        with suppress(psutil.NoSuchProcess, psutil.AccessDenied), process.oneshot():
+            cpu_s += sum(
+                process.cpu_times()[:4]
+            )  # its own and those of ended children, as user and as system
+            is_ready |= process.status() == psutil.STATUS_RUNNING
+    return Use(cpu_s, is_ready)
+
+
+def use_of_this() -> Use:
+    """Return what the other threads of this process, and all that it has started, use."""
+    use = use_of(*(process.pid for process in psutil.Process().children()))
+    ended = os.times()
+    own_s = time.process_time() - time.thread_time() + ended.children_user + ended.children_system
+    return Use(use.cpu_s + own_s, use.is_ready)
+
+
+def _with_children(pids: Iterable[int]) -> Iterable[psutil.Process]:
+    for pid in pids:
+        with suppress(psutil.NoSuchProcess):
+            process = psutil.Process(pid)
+            yield from (process, *process.children(recursive=True))
+
+
+class Silence:
+    """Counts for how long something that is waited for has not come.
+
+    Attributes:
+        computed_s: seconds of CPU that the processes used meanwhile, at most those of the clock.
+        idle_s: seconds of the clock in which they used none, and did not wait for a core either.
+    """
+
+    def __init__(self) -> None:
+        """Count from the first look."""
+        self.restart()
+
+    def restart(self) -> None:
+        """Count again, from the next look: what was waited for has come."""
+        self.computed_s = self.idle_s = 0.0
+        self._seen: tuple[Use, float] | None = None
+
+    def look(self, use: Use, now_s: float) -> float:
+        """Return the seconds counted so far; `now_s` is by the monotonic clock."""
+        if self._seen is not None:
+            before, looked_s = self._seen
+            used_s = use.cpu_s - before.cpu_s  # below 0 if a child is gone
+            if abs(used_s) > _IDLE_SHARE * (now_s - looked_s):
+                self.computed_s += min(max(used_s, 0.0), now_s - looked_s)
+            elif not use.is_ready:
+                # A longer pause was ours: the whole run stopped with Ctrl-Z, or the machine asleep.
+                self.idle_s += min(now_s - looked_s, 2 * LOOK_EVERY_S)
+        self._seen = use, now_s
+        return self.computed_s + self.idle_s
+
+    def __str__(self) -> str:
+        """Return the seconds in words, and how busy the machine is, for the message of one who gave up."""
+        load, cores = os.getloadavg()[0], os.cpu_count()
+        return (
+            f"{self.computed_s:.0f} s of CPU and {self.idle_s:.0f} s in which it did nothing "
+            f"(load average {load:.1f} on {cores} cores)"
+        )
+
+
+def wait_patiently(
+    arrives: Callable[[float], bool], limit_s: float, use: Callable[[], Use] = use_of_this
+) -> Silence | None:
+    """Wait until something arrives, for at most `limit_s` as `Silence` counts them.
+
+    Args:
+        arrives: waits for it, at most so many seconds, and returns whether it has come.
+        limit_s: patience with those that it is waited for.
+        use: what they have used of the machine.
+
+    Returns:
+        None if it has come, else the silence that took too long.
+    """
+    silence = Silence()
+    while not arrives(min(LOOK_EVERY_S, limit_s)):
+        if silence.look(use(), time.monotonic()) >= limit_s:
+            return silence
+    return None
