@@ -5,10 +5,13 @@ minutes. So a process is granted seconds of its CPU while it computes, and secon
 """
 
 import os
+import subprocess
+import threading
 import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 
 import psutil
 
@@ -93,6 +96,16 @@ class Silence:
         )
 
 
+def ends(thread: threading.Thread) -> Callable[[float], bool]:
+    """Return what waits for the end of a thread, for `wait_patiently`."""
+
+    def arrives(seconds: float) -> bool:
+        thread.join(seconds)
+        return not thread.is_alive()
+
+    return arrives
+
+
 def wait_patiently(
     arrives: Callable[[float], bool], limit_s: float, use: Callable[[], Use] = use_of_this
 ) -> Silence | None:
@@ -111,3 +124,25 @@ def wait_patiently(
         if silence.look(use(), time.monotonic()) >= limit_s:
             return silence
     return None
+
+
+def communicate(
+    process: subprocess.Popen[bytes], limit_s: float, given: bytes | None = None
+) -> tuple[bytes, bytes]:
+    """Return the output and errors of a program that reads `given`, once it has ended.
+
+    Raises:
+        TimeoutError: it has not ended within the limit, as `Silence` counts, and still runs.
+    """
+    written: list[tuple[bytes, bytes]] = []
+    left = [given]
+
+    def ended(seconds: float) -> bool:
+        with suppress(subprocess.TimeoutExpired):
+            written.append(process.communicate(left.pop() if left else None, seconds))
+        return bool(written)
+
+    silence = wait_patiently(ended, limit_s, partial(use_of, process.pid))
+    if silence is not None:
+        raise TimeoutError(str(silence))
+    return written[0]

@@ -21,15 +21,17 @@ from deepracer_exp.config.running import CollectorConfig
 from deepracer_exp.env.head_to_head import Rivals, Weights
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import RunFailed
+from deepracer_exp.patience import wait_patiently
 from deepracer_exp.runs.crash_dump import read_crash_dump
-from deepracer_exp.runs.files import HEARTBEAT
+from deepracer_exp.runs.files import HEARTBEAT, LOG
 
 from .base import Collector, by_worker, cars_per_process, states_of, steps_per_batch, worker_count
 from .sampling import SamplingPolicy
 from .watchdog import Watchdog
 from .worker import CarCollector, EnvFactory
 
-_LOOK_EVERY_S = 0.2
+_DEATH_S = 30.0
+"""Longest wait, after a pipe to a worker broke, until the system reports the end of its process."""
 _LAST_BATCH_S = 1.0  # wait at the end for a batch under way, which is not used, before its workers are killed
 _CHUNK_STEPS = 32  # control steps of each car between two counts of the episodes that have ended
 
@@ -78,7 +80,8 @@ class LocalCollector(Collector):
             )
         else:
             heartbeat = run_dir / HEARTBEAT
-            self._watchdog = Watchdog(heartbeat, self._workers, config.hang_timeout_s)
+            self._advice = f"; see {run_dir / LOG}"
+            self._watchdog = Watchdog(heartbeat, self._workers, config.hang_timeout_s, self._advice)
             envs = [
                 factory(worker=worker, threads=config.threads or 1, heartbeat=heartbeat)
                 for worker in range(self._workers)
@@ -212,21 +215,27 @@ class LocalCollector(Collector):
 
     def _ask(self, question: Callable[[], _T], silence: Callable[[], str]) -> _T:
         """Return the workers' answer; TorchRL alone would wait for it forever, even if the worker is dead."""
+        assert self._watchdog is not None
         answer = _in_background(question)
-        for _ in range(round(self._hang_timeout_s / _LOOK_EVERY_S)):
+
+        def arrives(seconds: float) -> bool:
+            return bool(wait([answer], seconds).done) or self._loss_now() is not None
+
+        silent = wait_patiently(arrives, self._hang_timeout_s, self._watchdog.use)
+        if answer.done():
             try:
-                return answer.result(_LOOK_EVERY_S)
-            except TimeoutError:
-                loss = self._loss()
+                return answer.result()
             except (RuntimeError, OSError, EOFError):  # what TorchRL and a broken pipe raise
-                loss = self._loss(patience_s=2.0)
+                loss = self._loss(_DEATH_S)
                 if loss is None:
                     raise
-            if loss is not None:
-                self._end_all()
-                raise loss
+        else:
+            loss = self._loss_now()
         self._end_all()
-        raise RunFailed(f"{silence()} for {self._hang_timeout_s:.0f} s and was ended")
+        raise loss or RunFailed(
+            f"{silence()} for {silent} and was ended; the limit: collector.hang_timeout_s="
+            f"{self._hang_timeout_s:g}{self._advice}"
+        )
 
     def _publish(self) -> None:
         for worker in range(self._workers):
@@ -253,7 +262,7 @@ class LocalCollector(Collector):
         try:
             batch: TensorDictBase = next(self._source)
         except (RuntimeError, ValueError, OSError, EOFError) as error:  # what TorchRL and a broken pipe raise
-            loss = self._loss(patience_s=2.0)
+            loss = self._loss(_DEATH_S)
             if loss is None:
                 raise
             self._end_all()
@@ -263,14 +272,12 @@ class LocalCollector(Collector):
         self._driven_at_s = time.monotonic()
         return batch.flatten(0, 1)
 
-    def _loss(self, patience_s: float = 0.0) -> RunFailed | None:
+    def _loss(self, patience_s: float) -> RunFailed | None:
         """Return the error about the first lost worker, None if all are still alive after `patience_s`."""
         give_up_at = time.monotonic() + patience_s
-        while True:
-            loss = self._loss_now()
-            if loss is not None or time.monotonic() >= give_up_at:
-                return loss
-            time.sleep(_LOOK_EVERY_S)
+        while (loss := self._loss_now()) is None and time.monotonic() < give_up_at:
+            time.sleep(0.05)
+        return loss
 
     def _loss_now(self) -> RunFailed | None:
         assert self._watchdog is not None

@@ -14,6 +14,8 @@ def start_workers_early(wanted: bool, *modules: str) -> None:
     One that runs already stays, or is ended if no workers are wanted. `modules` are imported for workers of a sweep;
     without them, what workers of a collector need.
     """
+    # By the clock, a worker waits so long for its first weights before it dies. Who hangs, the watchdog judges.
+    os.environ.setdefault("WEIGHT_SYNC_TIMEOUT", "86400")
     if not sys.platform.startswith("linux"):
         return
     import multiprocessing

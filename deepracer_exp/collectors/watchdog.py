@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-_LOOK_EVERY_S = 0.5
-# A hang before the first step has no other sign. Building the cars takes 2 s on a quiet machine; the first start after
-# an installation compiles as well, which took a minute on a busy one.
+from deepracer_exp.patience import LOOK_EVERY_S, Silence, Use, use_of, use_of_this
+
+# A hang before the first step has no other sign. Building the cars takes 2 s; the first start after an installation
+# compiles as well, for half a minute.
 _START_TIMEOUT_S = 120.0
 
 
@@ -23,22 +24,26 @@ class Watchdog:
     """Watches the workers' step counters while the training process waits for them.
 
     A worker that should be stepping and has not for `timeout_s` is killed, which the collector then reports as a
-    lost process; `verdict` says that it hung. Of workers that die, the first is remembered: TorchRL ends the others
-    before it reports.
+    lost process; `verdict` says that it hung. The limit is one of CPU time for a worker that computes, and of the clock
+    for one that does not (`Silence`). Of workers that die, the first is remembered: TorchRL ends the others before it
+    reports.
     """
 
-    def __init__(self, heartbeat: Path, workers: int, timeout_s: float):
+    def __init__(self, heartbeat: Path, workers: int, timeout_s: float, advice: str = ""):
         """Create the counters' file, one int64 per worker, and start watching.
 
-        Every worker delivers one part of each batch, and may rest until the next is asked for.
+        Every worker delivers one part of each batch, and may rest until the next is asked for. `advice` ends each
+        verdict: where to read more.
         """
         self._file = heartbeat
         np.full(workers, -1, np.int64).tofile(heartbeat)
         self._beats = np.memmap(heartbeat, np.int64, "r")
         self._timeout_s = timeout_s
         self._start_timeout_s = max(_START_TIMEOUT_S, timeout_s)
+        self._advice = advice
         self._delivered = np.zeros(workers, bool)
         self._processes: Sequence[BaseProcess] | None = None
+        self._pids: list[int] = []
         self._waiting = threading.Event()
         self._waiting.set()
         self._over = threading.Event()
@@ -51,6 +56,7 @@ class Watchdog:
 
     def workers_started(self, processes: Sequence[BaseProcess]) -> None:
         """Watch these processes."""
+        self._pids = [process.pid for process in processes if process.pid is not None]
         self._processes = processes
         sentinels = [process.sentinel for process in processes]
 
@@ -78,26 +84,36 @@ class Watchdog:
         self._thread.join()
         self._file.unlink(missing_ok=True)
 
+    def use(self) -> Use:
+        """Return what all workers use of the machine."""
+        return use_of(*self._pids)
+
     def _watch(self) -> None:
         seen = np.array(self._beats)
-        idle_s = np.zeros(len(seen))
-        looked = time.monotonic()
-        while not self._over.wait(_LOOK_EVERY_S):
-            now = time.monotonic()
+        silences = [Silence() for _ in seen]
+        while not self._over.wait(LOOK_EVERY_S):
             beats = np.array(self._beats)
-            # A longer pause was ours: the whole run stopped with Ctrl-Z, or the machine asleep.
-            idle_s += min(now - looked, 2 * _LOOK_EVERY_S) if self._waiting.is_set() else 0.0
-            idle_s[(beats != seen) | self._delivered] = 0.0
-            seen, looked = beats, now
-            for worker in np.flatnonzero(
-                idle_s > np.where(beats > 0, self._timeout_s, self._start_timeout_s)
-            ):
-                self._end(int(worker), float(idle_s[worker]), int(beats[worker]))
+            is_silent = (beats == seen) & ~self._delivered & self._waiting.is_set()
+            seen = beats
+            # Workers that are being started share what is compiled, so that some wait for others.
+            of_all = use_of_this() if is_silent.any() and self._processes is None else None
+            for worker, silence in enumerate(silences):
+                if not is_silent[worker]:
+                    silence.restart()
+                    continue
+                silent_s = silence.look(of_all or use_of(self._pids[worker]), time.monotonic())
+                if silent_s > (self._timeout_s if beats[worker] > 0 else self._start_timeout_s):
+                    self._end(worker, silence, int(beats[worker]))
 
-    def _end(self, worker: int, idle_s: float, steps: int) -> None:
+    def _end(self, worker: int, silence: Silence, steps: int) -> None:
         is_first = worker in self.verdict
+        limit = f"collector.hang_timeout_s={self._timeout_s:g}"
+        if steps <= 0:
+            limit = f"{_START_TIMEOUT_S:g} s for a start, or {limit} if that is longer"
         # Before the kill: the collector reads the verdict as soon as it sees the death.
-        self.verdict[worker] = f"took no step for {idle_s:.0f} s (after {max(steps, 0)} steps) and was ended"
+        self.verdict[worker] = (
+            f"took no step for {silence}, after {max(steps, 0)} steps, and was ended; the limit: {limit}{self._advice}"
+        )
         if self._processes is None:
             # They are still being started, and it is not yet known which is which; none of them can continue alone.
             # Repeated at every look, because another one may have been started since.

@@ -3,6 +3,7 @@
 import _signal  # type: ignore[import-not-found]
 import builtins
 import operator
+import os
 import signal
 import sys
 import threading
@@ -13,8 +14,8 @@ from multiprocessing.process import BaseProcess
 from types import FrameType, TracebackType
 from typing import Any, Self
 
-_WALL_FACTOR = 10
-"""Wall-clock limit over CPU limit: the machine may be that busy, and `sleep` uses no CPU."""
+_WAIT_FACTOR = 10
+"""Limit of waiting, such as in `sleep`, which uses no CPU, over the limit of CPU time."""
 _STREAMS = {"stdin": 0, "stdout": 1, "stderr": 2}
 """The standard streams and the numbers of their files."""
 _REFUSED: tuple[tuple[Any, str], ...] = (
@@ -43,10 +44,22 @@ class CtrlC(KeyboardInterrupt):
 # Those below `signal`, which looks up an enumeration's member each time: ten times as long as setting a handler.
 _set_handler, _get_handler = _signal.signal, _signal.getsignal
 _set_timer: Any = getattr(signal, "setitimer", None)
+_open, _read, _close = os.open, os.read, os.close
 _all, _map, _is, _len = all, map, operator.is_, len
 """Built-ins to compare built-ins with: by then they may be replaced."""
 _inside: set[int] = set()
 """Threads that are in a guarded block."""
+
+
+def _queued_s() -> float:
+    """Return the seconds for which this thread has been ready and had no core (Linux; elsewhere 0)."""
+    try:
+        file = _open("/proc/thread-self/schedstat", os.O_RDONLY)
+    except OSError:
+        return 0.0
+    text = _read(file, 100)
+    _close(file)
+    return int(text.split()[1]) * 1e-9
 
 
 def _refusal(owner: Any, name: str) -> Callable[..., Any]:
@@ -69,8 +82,9 @@ class Guard:
     """Runs a block of untrusted code; a context manager.
 
     The limit is CPU time of this thread: however busy the machine is, only the code itself can use it up. Code that
-    waits without computing is stopped after `_WALL_FACTOR` times the limit; time in which the whole process was
-    stopped does not count. The error is raised again and again, to get out of a loop whose bare `except:` swallows it.
+    waits without computing is stopped after `_WAIT_FACTOR` times the limit; time in which it waits for a core, or in
+    which the whole process was stopped, does not count. The error is raised again and again, to get out of a loop whose
+    bare `except:` swallows it.
     There is no limit outside the main thread, to which Python delivers signals, and on platforms without interval
     timers; C code that never returns to the interpreter cannot be stopped.
 
@@ -139,6 +153,7 @@ class Guard:
         """Restart the time limit, which is far cheaper than a new guard."""
         self._cpu_began_s = time.thread_time()
         self._waited_s = 0.0
+        self._queued_s: float | None = None
 
     def _arm(self, after_s: float) -> tuple[float, float]:
         """Set the timer to so many seconds, and from then on to intervals of the limit; return the previous timer."""
@@ -147,18 +162,21 @@ class Guard:
 
     def _on_alarm(self, signum: int, frame: FrameType | None) -> None:
         # Not the clock: a pause of the whole process counts as one interval at most.
-        self._waited_s += self._armed_s
+        queued_s, before_s = _queued_s(), self._queued_s
+        self._queued_s = queued_s
+        if before_s is not None:  # at the first alarm it is not known what part was waiting for a core
+            self._waited_s += max(self._armed_s - (queued_s - before_s), 0.0)
         if frame is not None and frame.f_code.co_filename == __file__:
             self._arm(1e-3)  # what was replaced is being restored, which must not be interrupted
             return
         used_s = time.thread_time() - self._cpu_began_s
-        wait_s = self._limit_s * _WALL_FACTOR
+        wait_s = self._limit_s * _WAIT_FACTOR
         left_s = min(self._limit_s - used_s, wait_s - self._waited_s)
         if left_s > 0:
             self._arm(max(left_s, 1e-3))
             return
         limit = f"the time limit of {self._limit_s:g} s of CPU for one step"
-        waits = f"{wait_s:g} s without computing: {_WALL_FACTOR} times {limit}"
+        waits = f"{wait_s:g} s without computing: {_WAIT_FACTOR} times {limit}"
         error = DeadlinePassed(f"took longer than {limit if used_s >= self._limit_s else waits}")
         # Again after a microsecond, two, four, ...: one of these meets a loop outside the `try` that catches the error.
         self._raised += 1

@@ -1,5 +1,6 @@
 """Calls of an MLflow store: each of them ends, and each error is one sentence."""
 
+import logging
 import re
 import threading
 import time
@@ -9,6 +10,7 @@ from functools import partial
 from typing import Any, TypeVar
 
 from deepracer_exp.addresses import redact
+from deepracer_exp.patience import ends, wait_patiently
 
 Value = TypeVar("Value")
 
@@ -17,8 +19,10 @@ CALL_S = 120.0
 
 The time limit of an HTTP request is one for the pause between two bytes: a server that sends one now and then would
 hold it for ever."""
-LOOKUP_S = 60.0
-"""Longest wait for all calls together of what is looked up in a store."""
+LOOKUP_S = 300.0
+"""Longest wait for all calls together of what is looked up in a store, for which a person waits."""
+_SAY_AFTER_S = 10.0
+_log = logging.getLogger(__name__)
 _WORTH_RETRYING = (408, 425, 429)
 
 
@@ -55,6 +59,8 @@ class BoundedClient:
 def ended_within(seconds: float, call: Callable[[], Value]) -> Value:
     """Return the result of a call; its thread is left alone when time is up, since nothing can end it.
 
+    While this process or one that it has started computes, its CPU time is what counts (`wait_patiently`).
+
     Raises:
         TimeoutError: time is up.
     """
@@ -70,7 +76,9 @@ def ended_within(seconds: float, call: Callable[[], Value]) -> Value:
     # Daemon, so that the process does not wait for it either.
     thread = threading.Thread(target=work, name="mlflow-call", daemon=True)
     thread.start()
-    thread.join(seconds)
+    if seconds > _SAY_AFTER_S and wait_patiently(ends(thread), _SAY_AFTER_S):
+        _log.warning("MLflow has not answered for %g s; it is waited for up to %.0f s", _SAY_AFTER_S, seconds)
+    wait_patiently(ends(thread), seconds)
     if errors:
         raise errors[0]
     if not results:
@@ -122,10 +130,19 @@ def _sentence(error: BaseException) -> str:
             "MLFLOW_TRACKING_PASSWORD"
         )
     if status is not None:
-        return f"the server answers with error {status}"
+        return f"the server answers with error {status}{_said(text)}"
     if isinstance(error, ParseError) or ("valid JSON" in text and not isinstance(error, RestException)):
         return "the answer is not that of an MLflow server"
     return redacted_line(getattr(error, "orig", None) or error)
+
+
+def _said(text: str) -> str:
+    """Return what a server said besides its error code, from MLflow's message; it may have sent a page."""
+    quoted = re.search(r"Response body: '(.*)'", text)
+    words = " ".join(re.sub(r"<[^>]*>", " ", quoted[1]).split()) if quoted else ""
+    # Control characters would reach the terminal.
+    shown = "".join(character if character.isprintable() else " " for character in words[:200])
+    return f": {redact(shown)}" if shown else ""
 
 
 def redacted_line(error: BaseException) -> str:

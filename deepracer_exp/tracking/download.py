@@ -17,6 +17,7 @@ from typing import Any
 from deepracer_exp.errors import BadInput, writing
 from deepracer_exp.files import read_json
 from deepracer_exp.lifeline import running
+from deepracer_exp.patience import communicate
 from deepracer_exp.runs.checkpoint_files import HASHES, checkpoint_sha256, verify
 from deepracer_exp.runs.files import (
     CHECKPOINTS,
@@ -94,9 +95,9 @@ def _run(what: str, wanted: Download, folder: Path) -> None:
     pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
     with running(command, **pipes) as process:
         try:
-            _, said = process.communicate(json.dumps(wanted.__dict__).encode(), _LONGEST_S)
-        except subprocess.TimeoutExpired:
-            raise BadInput(what, f"the download took more than {_LONGEST_S:.0f} s") from None
+            _, said = communicate(process, _LONGEST_S, json.dumps(wanted.__dict__).encode())
+        except TimeoutError as silence:
+            raise BadInput(what, f"the download has not ended within {silence}") from None
     if process.returncode:
         lines = said.decode(errors="replace").strip().splitlines() or ["the download ended"]
         raise BadInput(what, lines[-1])

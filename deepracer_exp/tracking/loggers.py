@@ -23,6 +23,7 @@ from deepracer_exp.config.running import (
     WandbTracking,
 )
 from deepracer_exp.errors import BadInput
+from deepracer_exp.patience import ends, wait_patiently
 from deepracer_exp.runs.files import TENSORBOARD, WANDB
 
 from .metrics import recordable_values
@@ -146,7 +147,7 @@ class WandbTracker(Tracker):
         code = 0 if status == "FINISHED" else 1
         ending = threading.Thread(target=self._logger.experiment.finish, args=(code,), daemon=True)
         ending.start()
-        ending.join(deadline_s)
+        wait_patiently(ends(ending), deadline_s)
         if ending.is_alive():
             self.failure = "W&B does not answer; `wandb sync` in the run folder uploads what is missing"
             _log.warning(self.failure)

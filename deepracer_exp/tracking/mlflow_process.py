@@ -228,6 +228,8 @@ def _answer(questions: Connection, answers: Connection) -> None:
 
 
 def _main() -> None:
+    # Its calls are repeated (`StoreThread`); a command, whose user waits, has MLflow's own patience of 120 s.
+    os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")
     gc.disable()  # while MLflow is imported, of which nothing is garbage
     questions, answers = Connection(os.dup(0), writable=False), Connection(os.dup(1), readable=False)
     # What MLflow prints is not shown.

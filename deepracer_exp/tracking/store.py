@@ -32,10 +32,9 @@ if TYPE_CHECKING:
     from mlflow import MlflowClient
     from mlflow.store.artifact.artifact_repo import ArtifactRepository
 
-# MLflow reads these at each call and offers no parameter. Its own 7 retries would hold the queue for
-# minutes after a server is back, and a request may hang for its whole 120 s: `StoreThread` retries instead.
+# MLflow reads this at each call and offers no parameter. Its own 7 retries would hold the queue for minutes after a
+# server is back: `StoreThread` retries instead.
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
-os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")
 # It would print the address of each ended run, with its password.
 os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
 # Without a network it would be retried during the whole run.
@@ -269,13 +268,10 @@ def existing_store(uri: str | None, runs_dir: Path) -> Store:
 
 
 @contextmanager
-def open_client(
-    what: str, uri: str | None, runs_dir: Path, total_s: float | None = None
-) -> "Iterator[MlflowClient]":
+def open_client(what: str, uri: str | None, runs_dir: Path) -> "Iterator[MlflowClient]":
     """Open a store and turn its errors into BadInput.
 
-    `what` begins the message; `uri` is the store, as in `tracking.uri`, None: the one in `runs_dir`; the calls within
-    the block take at most `total_s` in all (None: the usual wait for what is looked up).
+    `what` begins the message; `uri` is the store, as in `tracking.uri`, None: the one in `runs_dir`.
 
     Raises:
         BadInput: there is no store, it does not answer in time, or it refuses.
@@ -288,6 +284,6 @@ def open_client(
     try:
         # Within: its import takes three seconds, and nothing else needs it.
         with store_errors():
-            yield client_of(store, total_s or calls.LOOKUP_S)
+            yield client_of(store, calls.LOOKUP_S)
     except (StoreRefusedError, StoreUnavailableError) as error:
         raise BadInput(what, f"MLflow ({store.shown}): {error}") from error

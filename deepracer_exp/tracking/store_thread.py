@@ -1,13 +1,12 @@
 """A thread that keeps an MLflow store up to date, so that nothing else waits for the store."""
 
 import logging
-import math
 import random
 import threading
-import time
 from collections.abc import Callable, Mapping
 
 from deepracer_exp.errors import BadInput
+from deepracer_exp.patience import ends, wait_patiently
 
 from .calls import StoreRefusedError, StoreUnavailableError
 
@@ -45,7 +44,7 @@ class StoreThread:
         self._is_complete = False
         self._logged: set[str] = set()
         self._is_outage_logged = False
-        self._end_by = math.inf
+        self._is_over = threading.Event()
         self._may_begin = threading.Event()
         self._is_ending = threading.Event()
         # Daemon: a hanging store must not keep the process of a finished training alive.
@@ -57,11 +56,14 @@ class StoreThread:
         self._may_begin.set()
 
     def finish(self, deadline_s: float) -> bool:
-        """Update a last time, for at most `deadline_s`; return whether the store answered."""
-        self._end_by = time.monotonic() + deadline_s
+        """Update a last time, for at most `deadline_s`; return whether the store answered.
+
+        The limit is the store's: of a process that writes there and has not enough of a core, its CPU time counts.
+        """
         self._is_ending.set()
         self._may_begin.set()
-        self._thread.join(deadline_s)
+        wait_patiently(ends(self._thread), deadline_s)
+        self._is_over.set()
         return self._is_complete
 
     @property
@@ -73,14 +75,14 @@ class StoreThread:
         # Jitter, so that processes that began to wait together do not return together.
         pause_s, dice = 0.1, random.Random()
         self._may_begin.wait(UPDATE_S)
-        while time.monotonic() < self._end_by:
+        while not self._is_over.is_set():
             is_last = self._is_ending.is_set()
             try:
                 refused = self._update()
             except StoreUnavailableError as error:
                 self._log_outage(str(error))
                 if is_last:
-                    time.sleep(_LAST_PAUSE_S)
+                    self._is_over.wait(_LAST_PAUSE_S)
                 else:
                     self._is_ending.wait(pause_s + dice.uniform(0.0, 0.1))
                     pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)

@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from deepracer_exp.patience import wait_patiently
+
 from .calls import StoreRefusedError, StoreUnavailableError, ended_within
 from .metadata import END_TAG, NOTE, PARENT, STUDY, param_text, study_view, user_tags
 from .metrics import Point, now_ms, points_at, trial_metrics
@@ -109,7 +111,7 @@ class StudyRun:
 
     def wait_for_id(self, deadline_s: float = 30.0) -> str | None:
         """Return the run's id in MLflow; None if the store refuses or does not answer in time."""
-        self._settled.wait(deadline_s)
+        wait_patiently(self._settled.wait, deadline_s)
         return self.run_id
 
     @property

@@ -11,12 +11,14 @@ import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import IO
 
 from deepracer_exp.addresses import redact
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.lifeline import running
+from deepracer_exp.patience import use_of, wait_patiently
 
 from .calls import pages
 from .metadata import VIEW, WORKFLOW
@@ -110,13 +112,20 @@ def _is_free(port: int) -> bool:
 
 
 def _wait_until_it_answers(url: str, server: subprocess.Popen[bytes], output: IO[bytes]) -> None:
-    deadline = time.monotonic() + _START_S
-    while time.monotonic() < deadline and server.poll() is None:
+    def has_settled(seconds: float) -> bool:
+        if server.poll() is not None:
+            return True
         try:
             with _DIRECTLY.open(f"{url}/health", timeout=_ANSWER_S):
-                return
+                return True
         except OSError:
-            time.sleep(0.2)
-    output.seek(0)
-    lines = output.read().decode(errors="replace").strip().splitlines() or ["no output"]
-    raise RunFailed(f"MLflow's server did not start at {url}: {redact(lines[-1])}")
+            time.sleep(min(seconds, 0.2))
+            return False
+
+    silence = wait_patiently(has_settled, _START_S, partial(use_of, server.pid))
+    if server.poll() is not None:
+        output.seek(0)
+        lines = output.read().decode(errors="replace").strip().splitlines() or ["no output"]
+        raise RunFailed(f"MLflow's server did not start at {url}: {redact(lines[-1])}")
+    if silence is not None:
+        raise RunFailed(f"MLflow's server did not answer at {url} within {silence}, and was ended")

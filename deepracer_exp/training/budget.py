@@ -21,6 +21,7 @@ from deepracer_exp.errors import BadInput, count
 from deepracer_exp.files import RECORD_BYTES, open_user_file, read_bytes
 from deepracer_exp.lifeline import given_environment, running
 from deepracer_exp.lookup.next_steps import command_line, run_word
+from deepracer_exp.patience import communicate, ends, wait_patiently
 from deepracer_exp.runs.files import METRICS, SUMMARY, WRITTEN, read_config, read_object
 from deepracer_exp.runs.result import FAILED, INTERRUPTED, Ending
 
@@ -197,21 +198,21 @@ class Alerts:
                 self._threads[-1].start()
 
     def close(self) -> None:
-        """Wait up to 20 s for alerts still on their way."""
+        """Wait up to 20 s for alerts still on their way; CPU time counts, while they compute."""
         for thread in self._threads:
-            thread.join(_PATIENCE_S)
+            wait_patiently(ends(thread), _PATIENCE_S)
 
     def _run(self, command: tuple[str, ...], message: str, run_dir: Path) -> None:
         try:
             line, pipe = [*command, message, str(run_dir.resolve())], subprocess.PIPE
             environment, null = given_environment(), subprocess.DEVNULL
             with running(line, env=environment, stdin=null, stdout=pipe, stderr=pipe) as done:
-                _, said = done.communicate(timeout=_PATIENCE_S)
+                _, said = communicate(done, _PATIENCE_S)
+        except TimeoutError as silence:
+            _log.info("budget.alert_command was ended after %s", silence)
+            return
         except OSError as error:
             _log.info("budget.alert_command cannot be run: %s", error.strerror or error)
-            return
-        except subprocess.TimeoutExpired:
-            _log.info("budget.alert_command was ended after %.0f s", _PATIENCE_S)
             return
         if done.returncode:
             last = said.decode(errors="replace").strip().splitlines()[-1:] or ["no message"]

@@ -26,7 +26,7 @@ def processes():
 @pytest.fixture
 def watch(tmp_path, monkeypatch, processes):
     """Watch two workers, which have begun."""
-    monkeypatch.setattr(watchdog, "_LOOK_EVERY_S", 0.05)
+    monkeypatch.setattr(watchdog, "LOOK_EVERY_S", 0.05)
     monkeypatch.setattr(watchdog, "_START_TIMEOUT_S", 1.0)
     made = []
 
@@ -63,6 +63,8 @@ def test_a_worker_without_a_step_is_ended_and_the_other_lives(watch, beats, proc
     _keep_beating(counters, [1], dog)
     assert list(dog.verdict) == [0]
     assert "after 1 steps" in dog.verdict[0]
+    assert "collector.hang_timeout_s=1" in dog.verdict[0]
+    assert "load average" in dog.verdict[0]
     processes[0].join(PATIENCE_S)
     assert processes[0].exitcode == -signal.SIGKILL
     assert processes[1].is_alive()

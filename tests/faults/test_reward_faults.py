@@ -172,7 +172,7 @@ def test_a_reward_that_is_deaf_to_its_time_limit_is_ended_by_the_watchdog(start_
     path.write_text(DEAF)
     training = start_training(f"reward.file={path}", "reward.time_limit_s=1", "collector.hang_timeout_s=10")
     ended = training.end()
-    ended.assert_run_failed("collector worker", "took no step for", "(after 3 steps)")
+    ended.assert_run_failed("collector worker", "took no step for", "after 3 steps, and was ended")
     training.assert_nothing_left()
 
 
