@@ -174,9 +174,9 @@ class Started:
         """Wait until the first worker of the collector is being started and return it."""
         return self.wait_for(self.workers, "worker")[0]
 
-    def wait_for(self, condition: Callable[[], Any], what: str, within_s: float = PATIENCE_S) -> Any:
+    def wait_for(self, condition: Callable[[], Any], what: str) -> Any:
         """Wait until a condition holds and return it."""
-        give_up_at = time.monotonic() + within_s
+        give_up_at = time.monotonic() + PATIENCE_S
         while (began := time.monotonic()) < give_up_at:
             value = condition()
             if value:
@@ -184,7 +184,7 @@ class Started:
             assert self.popen.poll() is None, f"ended before {what}: {self._said()}"
             # A condition that looks at all processes must not take a core from those that it waits for.
             time.sleep(max(0.02, 4.0 * (time.monotonic() - began)))
-        pytest.fail(f"no {what} within {within_s} s: {self._said()}")
+        pytest.fail(f"no {what} within {PATIENCE_S:g} s: {self._said()}")
 
     def _said(self) -> str:
         """Return what the command has written to stderr, and the workers of a sweep to their log."""
@@ -199,14 +199,14 @@ class Started:
         """Send a signal to all processes of the session, as a terminal does."""
         os.killpg(self.popen.pid, signum)
 
-    def end(self, timeout_s: float = PATIENCE_S) -> Ended:
+    def end(self) -> Ended:
         """Wait for the end and return what is left."""
-        code = self.popen.wait(timeout_s)
+        code = self.popen.wait(PATIENCE_S)
         return Ended(code, self._out.read_text(), self._err.read_text(), self.cwd)
 
-    def assert_nothing_left(self, within_s: float = 10.0) -> None:
+    def assert_nothing_left(self) -> None:
         """Nothing that was started lives, and nothing of what `workers` saw mapped lies in shared memory."""
-        give_up_at = time.monotonic() + within_s
+        give_up_at = time.monotonic() + PATIENCE_S
         while True:
             alive, shm = self.processes(), [path for path in self._shm if path.exists()]
             if not alive and not shm:

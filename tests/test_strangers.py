@@ -161,7 +161,6 @@ def test_a_run_of_ones_own_is_resumed_and_cloned_with_all_that_it_had(call, acco
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 def test_a_study_of_a_stranger_imports_nothing_and_ones_own_resumes(run_at, account, tmp_path):
     canary, sent = tmp_path / "canary", tmp_path / "sent"
     (tmp_path / "evilnet.py").write_text(EVIL_CLASS.format(canary=str(canary)))

@@ -21,7 +21,7 @@ sys.exit(supervised(call))
 LISTENS = """
     with Interruption() as interruption:
         print("listens", flush=True)
-        for _ in range(600):
+        for _ in range(20_000):
             time.sleep(0.05)
             if interruption.signum:
                 time.sleep(0.5)  # a second signal, which ends at once, would arrive by now

@@ -46,7 +46,6 @@ READERS = {
 }
 
 
-@pytest.mark.timeout(20)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", READERS)
 def test_whatever_a_file_is_its_reader_takes_it_or_names_it_in_one_line(tmp_path, name, kind):

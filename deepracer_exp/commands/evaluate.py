@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from deepracer_exp.evaluation.plan import EvaluatePlan
 
 _EVALUATE_EPILOG = """\
-  deepracer-exp evaluate RUN                                its best checkpoint
+  deepracer-exp evaluate RUN                                its best checkpoint, on the trials of its training
   deepracer-exp evaluate RUN evaluation=summit              three_trials, four_minutes, summit or aws_virtual
   deepracer-exp evaluate RUN evaluation=real_car            as the physical car sees and acts
   deepracer-exp evaluate RUN evaluation=head_to_head rival=RUN
@@ -261,7 +261,7 @@ def _watch(args: argparse.Namespace) -> int:
         from deepracer_exp.training.budget import Budget
 
         used = Budget(plan.run.experiment.budget, plan.run.path).used
-        serve_live(plan.run, plan.training_protocol, server, used)
+        serve_live(plan.run, plan.config.evaluation, server, used)
     return 0
 
 
@@ -312,7 +312,7 @@ def _replay_laps(args: argparse.Namespace) -> int:
     from deepracer_exp.reports.driven_laps import laps_to_replay
     from deepracer_exp.reports.lap_replay import fastest_lap_of_log
 
-    protocol = plan.training_protocol
+    protocol = plan.config.evaluation
     with warnings_on_stderr():
         laps = laps_to_replay(plan.run, protocol, ordinary=not runs[1:])
         if view is not None:
@@ -373,7 +373,7 @@ def _checkpoints(args: argparse.Namespace) -> int:
     progress = Terminal(stderr=True, highlight=False, markup=False)
     with warnings_on_stderr():
         show_checkpoints(
-            plan.run, plan.training_protocol, args.output, table_console(160), progress, plan.rival
+            plan.run, plan.config.evaluation, args.output, table_console(160), progress, plan.rival
         )
     return 0
 

@@ -80,7 +80,7 @@ def compose_experiment(overrides: Sequence[str], *, stored: bool = False) -> tup
     """
     composition = compose_entry("train", overrides, stored=stored)
     experiment = parse_experiment(composition.mapping)
-    _check_names(experiment.evaluation)
+    check_names(experiment.evaluation)
     acting.refuse_reward(experiment.reward.file, "the study")
     import_own_classes(experiment)
     return experiment, composition
@@ -90,7 +90,7 @@ def compose_evaluation(overrides: Sequence[str]) -> tuple[EvaluateConfig, Compos
     """Compose `conf/evaluate.yaml` with the overrides and validate the result; raises as `compose_experiment`."""
     composition = compose_entry("evaluate", overrides)
     config = parse_config(composition.mapping, EvaluateConfig)
-    _check_names(config.evaluation)
+    check_names(config.evaluation)
     return config, composition
 
 
@@ -223,7 +223,7 @@ def check_choice(group: str, value: object) -> None:
         check_option(group, name)
 
 
-def _check_names(evaluation: EvaluationConfig) -> None:
+def check_names(evaluation: EvaluationConfig) -> None:
     """Refuse names of options that an evaluation could not find."""
     tracks = [evaluation.tracks] if isinstance(evaluation.tracks, str) else evaluation.tracks or ()
     for name in tracks:

@@ -2,16 +2,19 @@
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 from deepracer_exp.addresses import without_passwords
 from deepracer_exp.errors import BadInput, Unknown, nearest
 
 from . import acting, custom_files
-from .compose import Composition, compose_entry
+from .compose import Composition, check_names, compose_entry
+from .evaluation import EvaluateConfig, EvaluationConfig
 from .options import groups
 from .overrides import OPEN_MAPPINGS, parse_single
 from .own_class import allow, allow_given
+from .parse import parse_config
 from .rooms import in_rooms
 
 _WHOLE = ("experiment", custom_files.KEY)
@@ -78,6 +81,25 @@ def with_overrides(
         names={},
         notes=tuple(line for line in left_out if not _touches(keys, line.partition("=")[0])),
     )
+
+
+def evaluate_as_stored(
+    request: Composition, protocol: EvaluationConfig, overrides: Sequence[str]
+) -> EvaluateConfig:
+    """Return a request of an evaluation by a stored run's protocol, with single values of it changed.
+
+    Args:
+        request: as composed, with another protocol.
+        protocol: the run's.
+        overrides: of the protocol, such as ``evaluation.trials=20``.
+
+    Raises:
+        BadInput: an override cannot be parsed, names something unknown or gives a value that is not accepted.
+    """
+    changed = with_overrides({"evaluation": asdict(protocol)}, {}, overrides)
+    config = parse_config(request.mapping | changed.mapping, EvaluateConfig)
+    check_names(config.evaluation)
+    return config
 
 
 def config_differences(configs: Sequence[Mapping[str, Any]], prefix: str = "") -> dict[str, list[Any]]:

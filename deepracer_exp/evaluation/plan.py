@@ -7,14 +7,17 @@ from pathlib import Path
 from deepracer_exp.config.compose import compose_evaluation, compose_option
 from deepracer_exp.config.evaluation import EvaluateConfig, EvaluationConfig
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.config.overrides import group_of
+from deepracer_exp.config.overrides import group_of, key_of
 from deepracer_exp.config.own_class import OF_POLICY
 from deepracer_exp.config.parse import import_own_classes
 from deepracer_exp.config.race import RaceConfig
+from deepracer_exp.config.stored import evaluate_as_stored
 from deepracer_exp.env.real_car import require_car
 from deepracer_exp.errors import BadInput
 from deepracer_exp.lookup.resolve import StoredRun, resolve
 from deepracer_exp.lookup.rival import find_rival, kept_rival
+
+_PROTOCOL = "evaluation"
 
 
 @dataclass(frozen=True)
@@ -24,8 +27,7 @@ class EvaluatePlan:
     run: StoredRun
     """The run, with its checkpoint."""
     config: EvaluateConfig
-    training_protocol: EvaluationConfig
-    """The protocol that was named; if none was, the one by which the training evaluated."""
+    """Its protocol is the one that was named; if none was, that by which the training evaluated, with the changes."""
     rival: StoredRun | None = None
     """The run, with its checkpoint, that drives the rival; None: there is none, or it is the policy itself."""
 
@@ -34,21 +36,22 @@ def plan_evaluation(run: str, overrides: Sequence[str], *, has_checkpoint: bool 
     """Compose an evaluation, and find the run that it races, and its checkpoint if `has_checkpoint`.
 
     Raises:
-        BadInput: as for `compose_evaluation`, `resolve`, `StoredRun.with_policy` and `find_rival`, a rival is named for
-            a race without one, or the physical car could not run the policy.
+        BadInput: as for `compose_evaluation`, `evaluate_as_stored`, `resolve`, `StoredRun.with_policy` and
+            `find_rival`, a rival is named for a race without one, or the physical car could not run the policy.
     """
-    config, _ = compose_evaluation(overrides)
+    is_named = any(key_of(override) == _PROTOCOL for override in overrides)
+    changes = [] if is_named else [override for override in overrides if group_of(override) == _PROTOCOL]
+    config, composition = compose_evaluation([override for override in overrides if override not in changes])
     stored = resolve(run, Path(config.runs_dir), config.tracking.uri)
     if has_checkpoint:
         stored = stored.with_policy(config.checkpoint)
     else:
         import_own_classes(stored.experiment, OF_POLICY)
+    if not is_named:
+        config = evaluate_as_stored(composition, stored.experiment.evaluation, changes)
     if config.evaluation.real_car is not None:
         require_car(stored.experiment)
-    rival = _rival(stored, config)
-    is_named = any(group_of(override) == "evaluation" for override in overrides)
-    protocol = config.evaluation if is_named else stored.experiment.evaluation
-    return EvaluatePlan(stored, config, protocol, rival)
+    return EvaluatePlan(stored, config, _rival(stored, config))
 
 
 def race_of(experiment: Experiment, config: EvaluationConfig) -> RaceConfig:

@@ -106,6 +106,12 @@ class CarCheck:
         figures = car_figures({name: laps.evaluation for name, laps in self.laps.items()})
         shares = {name: figure["lap_share"] for name, figure in figures.items()}
         weak = [name for name in self.laps if name != SIMULATOR and shares[name] < LEAST_ON_CAR]
+        if not shares[SIMULATOR]:  # nothing that is seen of such a policy says anything of a trained one
+            return [
+                *steps,
+                "in the simulator no lap is complete: the policy has not learned to drive; train it for longer "
+                "(deepracer-exp resume RUN budget.env_steps=N)",
+            ]
         if shares[SIMULATOR] < RELIABLE:
             weak = []  # what fails in the simulator already says nothing of the car
             steps.append(

@@ -76,7 +76,7 @@ def test_listing_runs_imports_neither_mlflow_nor_torch(tmp_path):
         "finally:\n    print([n for n in ('mlflow', 'torch', 'pandas', 'hydra') if n in sys.modules], file=sys.stderr)"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=True
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
     )
     assert done.stderr == "[]\n"
     assert "a/run" in done.stdout
@@ -111,5 +111,5 @@ def test_the_shell_completes_commands_groups_options_and_runs(tmp_path, typed, c
         "COMP_POINT": str(len(line)),
         "COMP_TYPE": "9",
     }
-    subprocess.run(command(), cwd=tmp_path, env=os.environ | asked, timeout=60, check=False)
+    subprocess.run(command(), cwd=tmp_path, env=os.environ | asked, check=False)
     assert completion in (tmp_path / "completions").read_text().split("\n")

@@ -12,6 +12,7 @@ import yaml
 from rich.console import Console
 
 from deepracer_exp.evaluation.evaluate import results_table
+from deepracer_exp.evaluation.plan import plan_evaluation
 from deepracer_exp.evaluation.result import Evaluation
 from deepracer_exp.lookup.resolve import resolve
 from deepracer_exp.runs.checkpoints import read_checkpoint
@@ -107,8 +108,6 @@ def test_evaluate_prints_a_table_and_writes_a_file(run_dir, call):
     [
         (("evaluate",), ("RUN: missing",)),
         (("evaluate", "nowhere"), ("nowhere: no such run",)),
-        (("evaluate", "x", "evaluation.trails=2"), ("evaluation.trails", "trials")),
-        (("evaluate", "x", "evaluation.trials=0"), ("evaluation.trials=0",)),
         (
             ("evaluate", "x", "tracking=off"),
             ("tracking: no such group for evaluate", "accepted: tracking.uri"),
@@ -117,13 +116,46 @@ def test_evaluate_prints_a_table_and_writes_a_file(run_dir, call):
         (("checkpoints", "evaluation=summit"), ("RUN: missing",)),
         (("checkpoints", "one", "two"), ("one two: 2 runs given",)),
         (("checkpoints", "x", "checkpoint=best"), ("checkpoint=best", "evaluate")),
-        (("checkpoints", "x", "evaluation.trails=2"), ("evaluation.trails", "trials")),
         (("checkpoints", "x", "-o", "nowhere/picture.html"), ("--output nowhere/picture.html",)),
         (("checkpoints", "x", "-o", "picture.txt"), ("--output picture.txt",)),
     ],
 )
 def test_bad_input_is_one_line(call, arguments, words):
     call(*arguments).assert_refused(*words)
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("evaluation.trails=2", ("evaluation.trails", "trials")),
+        ("evaluation.trials=0", ("evaluation.trials=0",)),
+        ("evaluation.tracks=Ovale", ("evaluation.tracks", "Oval_track")),
+    ],
+)
+@pytest.mark.parametrize("command", ["evaluate", "checkpoints"])
+def test_a_bad_value_of_the_run_s_protocol_is_one_line(run_dir, call, command, override, words):
+    call(command, run_dir.name, override).assert_refused(*words)
+
+
+def test_a_run_is_evaluated_as_its_training_did_unless_a_protocol_is_named(run_dir):
+    change_config(run_dir, "evaluation", trials=5, time_s=7.5)
+    store = f"runs_dir={run_dir.parents[1]}"
+    trained = resolve(str(run_dir), run_dir.parents[1], None).experiment.evaluation
+    assert plan_evaluation(str(run_dir), [store]).config.evaluation == trained
+    changed = plan_evaluation(str(run_dir), [store, "evaluation.seed=3"]).config.evaluation
+    assert (changed.trials, changed.time_s, changed.seed) == (5, 7.5, 3)
+    named = plan_evaluation(str(run_dir), [store, "evaluation=three_trials", "evaluation.seed=3"])
+    assert (named.config.evaluation.trials, named.config.evaluation.seed) == (3, 3)
+
+
+def test_evaluate_repeats_the_figures_of_the_training_s_last_screen(run_dir, call):
+    summary = json.loads((run_dir / "summary.json").read_text())["best"]
+    ended = call("evaluate", run_dir.name)
+    assert ended.code == 0, ended.stderr
+    (file,) = (run_dir / "evaluations").iterdir()
+    usual, _ = json.loads(file.read_text())["groups"]
+    assert len(usual["attempts"]) == summary["eval_laps_tried"]
+    assert usual["completion"]["mean"] == pytest.approx(summary["eval_completion"])
 
 
 def test_a_video_needs_a_library_to_draw_with(run_dir, call, monkeypatch):

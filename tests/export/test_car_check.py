@@ -144,6 +144,13 @@ def test_what_fails_in_the_simulator_is_not_blamed_on_the_car():
     assert "in the simulator" in steps[0]
 
 
+def test_a_policy_that_has_not_learned_to_drive_is_to_be_trained_and_not_cloned():
+    nothing = {name: 0.0 for name in (SIMULATOR, "picture", "controls", CAR)}
+    (step,) = check(pictures=(200, 110), zigzag=SWERVING, **nothing).to_do()
+    assert "deepracer-exp resume RUN budget.env_steps=N" in step
+    assert "clone" not in step
+
+
 def test_only_pictures_in_which_a_small_change_turns_the_wheels_decide_badly():
     policy = Threshold(100)
     tried = try_pictures(policy, seen(policy, 200, 110, 40, 90), ACTIONS)

@@ -1,6 +1,6 @@
 """kill -9 of each process that the program starts, at random moments, again and again.
 
-What the killed one had started is gone within ten seconds, and study and run resume. `FAULT_TIMES=20` kills each of
+What the killed one had started is gone, and study and run resume. `FAULT_TIMES=20` kills each of
 them twenty times (`make test-faults`), `KILL_LOOPS=FILE` adds a line of what was measured.
 """
 
@@ -22,10 +22,9 @@ from tests.waiting import PATIENCE_S
 from .test_killed_sweeps import Sweep, assert_every_trial_is_accounted_for_once, claims
 
 KILLS = int(os.environ.get("FAULT_TIMES", "1"))
-GONE_S = 10.0
 MANY = "sweep.trials=10000"
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(60 + 300 * KILLS)]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800 * KILLS)]
 
 
 @pytest.fixture
@@ -36,7 +35,7 @@ def kill(request):
     def go(victim, doomed, moment):
         victim.kill()
         began = time.monotonic()
-        while (left := doomed()) and time.monotonic() < began + GONE_S:
+        while (left := doomed()) and time.monotonic() < began + PATIENCE_S:
             time.sleep(0.05)
         lines = [" ".join(process.cmdline())[:120] for process in left]
         kills.append({"moment": moment, "gone_after_s": round(time.monotonic() - began, 2), "left": lines})
@@ -136,7 +135,7 @@ def test_nothing_outlives_a_killed_run_and_it_resumes(start, tmp_path, kill):
         started.popen.wait()
         folders = [path.parent for path in tmp_path.glob("runs/tiny/*/config.yaml")]
     (folder,) = folders
-    last = start("resume", str(folder)).end(PATIENCE_S + 10.0 * KILLS)
+    last = start("resume", str(folder)).end()
     assert last.code == 0, last.stderr
     assert read_object(folder / "summary.json")["status"] == "finished"
     assert [row["iteration"] for row in read_metrics(folder / "metrics.jsonl")] == list(

@@ -62,7 +62,6 @@ def recorded(tmp_path) -> int:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 def test_a_killed_run_that_is_resumed_is_the_run_that_was_not_killed(start, tmp_path):
     killed_after(start, (*RUN, "runs_dir=cut"), lambda: recorded(tmp_path) >= 6)
     folder = folder_of(tmp_path, "cut")
@@ -73,7 +72,6 @@ def test_a_killed_run_that_is_resumed_is_the_run_that_was_not_killed(start, tmp_
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 def test_killed_at_random_moments_it_still_is(start, tmp_path):
     moments = random.Random(7)
     arguments = (*RUN, "runs_dir=cut")

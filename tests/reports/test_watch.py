@@ -319,7 +319,7 @@ def test_the_live_page_is_served_to_this_machine_alone():
         assert server.server_address[0] == "127.0.0.1"
 
         def get(path: str, **headers: str) -> tuple[int, str]:
-            asked = http.client.HTTPConnection(*server.server_address, timeout=10)
+            asked = http.client.HTTPConnection(*server.server_address)
             asked.request("GET", path, headers=headers)
             answer = asked.getresponse()
             return answer.status, answer.read().decode()

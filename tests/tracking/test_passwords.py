@@ -115,7 +115,6 @@ def all_rows(url: str) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 def test_no_password_reaches_an_output_a_file_a_database_or_mlflow(
     server, postgres, start, call_at, tmp_path, monkeypatch
 ):

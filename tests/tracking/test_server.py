@@ -41,7 +41,6 @@ def test_a_server_that_is_away_blocks_nothing_and_gets_everything_once(server, t
     assert "summary.json" in [file.path for file in client.list_artifacts(tracker.run_id)]
 
 
-@pytest.mark.timeout(600)
 def test_recordings_and_servers_that_are_killed_by_turns_leave_every_point_once(server, tmp_path):
     script = Path(__file__).parents[1] / "faults" / "killed_recording.py"
     recording = subprocess.Popen(
