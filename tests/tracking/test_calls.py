@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from functools import partialmethod
 
 import pytest
+from mlflow.environment_variables import MLFLOW_HTTP_REQUEST_TIMEOUT
 
 from deepracer_exp.tracking import calls
 from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
@@ -59,6 +60,19 @@ def test_a_run_that_is_not_recorded_says_so_and_why(odd, tmp_path, wait_until, c
     assert tracker.failure is not None
     assert tracker.failure.startswith(f"MLflow ({uri}): some of this run was not recorded: ")
     assert words in tracker.failure
+
+
+def test_a_person_who_waits_is_told_so(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(calls, "LOOKUP_S", 1.0)
+    monkeypatch.setattr(calls, "_SAY_AFTER_S", 0.1)
+    with odd_server("hang") as uri:
+        assert "no answer within 1 s" in refused(look_up, "x@champion", uri, tmp_path)
+    assert "MLflow has not answered for 0.1 s; it is waited for up to 1 s" in caplog.text
+
+
+def test_a_command_has_the_patience_of_mlflow_s_own_client(monkeypatch):
+    monkeypatch.delenv("MLFLOW_HTTP_REQUEST_TIMEOUT", raising=False)
+    assert MLFLOW_HTTP_REQUEST_TIMEOUT.get() == calls.CALL_S
 
 
 @pytest.mark.slow

@@ -10,7 +10,8 @@ import psutil
 import pytest
 from mlflow import MlflowClient
 
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.tracking import ui
 from deepracer_exp.tracking.metadata import VIEW, run_params, run_tags
 from deepracer_exp.tracking.metrics import METRICS
 from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
@@ -60,6 +61,12 @@ def test_a_look_at_no_runs_says_to_train_first_and_creates_nothing(tmp_path):
 def test_a_server_that_does_not_answer_has_no_page_to_open(tmp_path, free_port):
     with pytest.raises(BadInput, match=rf"ui of http://127.0.0.1:{free_port}: "):
         serve_ui(tmp_path, f"http://me:s3cr3t@127.0.0.1:{free_port}", 5000, print)
+
+
+def test_a_server_that_is_given_up_is_not_said_to_have_ended(store, tmp_path, free_port, monkeypatch):
+    monkeypatch.setattr(ui, "_START_S", 0.2)
+    with pytest.raises(RunFailed, match=r"did not answer at http.* within .* s of CPU and .*load average"):
+        running_ui(store, free_port).__enter__()
 
 
 @pytest.mark.slow
