@@ -35,9 +35,7 @@ def use_of(*pids: int) -> Use:
     cpu_s, is_ready = 0.0, False
     for process in _with_children(pids):
         with suppress(psutil.NoSuchProcess, psutil.AccessDenied), process.oneshot():
-            cpu_s += sum(
-                process.cpu_times()[:4]
-            )  # its own and those of ended children, as user and as system
+            cpu_s += sum(process.cpu_times()[:4])  # with those of ended children
             is_ready |= process.status() == psutil.STATUS_RUNNING
     return Use(cpu_s, is_ready)
 

@@ -3,7 +3,6 @@
 import logging
 import re
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -19,8 +18,6 @@ CALL_S = 120.0
 
 The time limit of an HTTP request is one for the pause between two bytes: a server that sends one now and then would
 hold it for ever."""
-LOOKUP_S = 300.0
-"""Longest wait for all calls together of what is looked up in a store, for which a person waits."""
 _SAY_AFTER_S = 10.0
 _log = logging.getLogger(__name__)
 _WORTH_RETRYING = (408, 425, 429)
@@ -35,15 +32,13 @@ class StoreRefusedError(Exception):
 
 
 class BoundedClient:
-    """A client of MLflow of which every call ends; in all, with what connects it, they take at most `total_s`.
+    """A client of MLflow of which every call ends.
 
     Its methods raise TimeoutError, which is an OSError, when their time is up.
     """
 
-    def __init__(self, connect: Callable[[], Any], total_s: float | None = None) -> None:
-        """Connect, which counts, too."""
-        self._end_by = None if total_s is None else time.monotonic() + total_s
-        self._client = self._call(connect)
+    def __init__(self, client: Any) -> None:
+        self._client = client
 
     def __getattr__(self, name: str) -> Any:
         attribute = getattr(self._client, name)
@@ -52,8 +47,7 @@ class BoundedClient:
         return partial(self._call, attribute)
 
     def _call(self, call: Callable[..., Any], *args: Any, **options: Any) -> Any:
-        left_s = CALL_S if self._end_by is None else max(self._end_by - time.monotonic(), 0.0)
-        return ended_within(left_s, lambda: call(*args, **options))
+        return ended_within(CALL_S, lambda: call(*args, **options))
 
 
 def ended_within(seconds: float, call: Callable[[], Value]) -> Value:
@@ -76,9 +70,10 @@ def ended_within(seconds: float, call: Callable[[], Value]) -> Value:
     # Daemon, so that the process does not wait for it either.
     thread = threading.Thread(target=work, name="mlflow-call", daemon=True)
     thread.start()
-    if seconds > _SAY_AFTER_S and wait_patiently(ends(thread), _SAY_AFTER_S):
-        _log.warning("MLflow has not answered for %g s; it is waited for up to %.0f s", _SAY_AFTER_S, seconds)
-    wait_patiently(ends(thread), seconds)
+    first_s = min(_SAY_AFTER_S, seconds)
+    if wait_patiently(ends(thread), first_s) and first_s < seconds:
+        _log.warning("MLflow has not answered for %g s; it is waited for up to %.0f s", first_s, seconds)
+        wait_patiently(ends(thread), seconds - first_s)
     if errors:
         raise errors[0]
     if not results:

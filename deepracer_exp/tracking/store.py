@@ -213,8 +213,8 @@ def silence_mlflow() -> None:
         logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
-def client_of(store: Store, total_s: float | None = None) -> "MlflowClient":
-    """Return a client of a store, whose calls all end; in all they take at most `total_s`.
+def client_of(store: Store) -> "MlflowClient":
+    """Return a client of a store, whose calls all end.
 
     All clients use the user and password of the latest one's store.
 
@@ -233,10 +233,9 @@ def client_of(store: Store, total_s: float | None = None) -> "MlflowClient":
     def connect() -> MlflowClient:
         return MlflowClient(tracking_uri=store.uri, registry_uri=store.uri)
 
-    if store.sqlite_file is None:
-        return cast("MlflowClient", BoundedClient(connect, total_s))
-    client = connect()  # a file answers, but its tables may have to be created first
-    return cast("MlflowClient", BoundedClient(lambda: client, total_s))
+    # A file answers, but its tables may have to be created first.
+    client = connect() if store.sqlite_file else ended_within(calls.CALL_S, connect)
+    return cast("MlflowClient", BoundedClient(client))
 
 
 def is_run_id(text: str) -> bool:
@@ -284,6 +283,6 @@ def open_client(what: str, uri: str | None, runs_dir: Path) -> "Iterator[MlflowC
     try:
         # Within: its import takes three seconds, and nothing else needs it.
         with store_errors():
-            yield client_of(store, calls.LOOKUP_S)
+            yield client_of(store)
     except (StoreRefusedError, StoreUnavailableError) as error:
         raise BadInput(what, f"MLflow ({store.shown}): {error}") from error

@@ -33,7 +33,6 @@ def odd(request, free_port, monkeypatch) -> Iterator[tuple[str, str]]:
     """Address of an odd server, and what is said of it."""
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_TIMEOUT", "2")
     monkeypatch.setattr(calls, "CALL_S", 4.0)
-    monkeypatch.setattr(calls, "LOOKUP_S", 4.0)
     if request.param == "closed":
         yield f"http://127.0.0.1:{free_port}", ODD["closed"]
         return
@@ -63,7 +62,7 @@ def test_a_run_that_is_not_recorded_says_so_and_why(odd, tmp_path, wait_until, c
 
 
 def test_a_person_who_waits_is_told_so(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(calls, "LOOKUP_S", 1.0)
+    monkeypatch.setattr(calls, "CALL_S", 1.0)
     monkeypatch.setattr(calls, "_SAY_AFTER_S", 0.1)
     with odd_server("hang") as uri:
         assert "no answer within 1 s" in refused(look_up, "x@champion", uri, tmp_path)
