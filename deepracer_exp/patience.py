@@ -125,15 +125,15 @@ def wait_patiently(
 
 
 def communicate(
-    process: subprocess.Popen[bytes], limit_s: float, given: bytes | None = None
+    process: subprocess.Popen[bytes], limit_s: float, stdin: bytes | None = None
 ) -> tuple[bytes, bytes]:
-    """Return the output and errors of a program that reads `given`, once it has ended.
+    """Return the output and errors of a program that reads `stdin`, once it has ended.
 
     Raises:
         TimeoutError: it has not ended within the limit, as `Silence` counts, and still runs.
     """
     written: list[tuple[bytes, bytes]] = []
-    left = [given]
+    left = [stdin]
 
     def ended(seconds: float) -> bool:
         with suppress(subprocess.TimeoutExpired):

@@ -134,10 +134,10 @@ def _sentence(error: BaseException) -> str:
 def _said(text: str) -> str:
     """Return what a server said besides its error code, from MLflow's message; it may have sent a page."""
     quoted = re.search(r"Response body: '(.*)'", text)
-    words = " ".join(re.sub(r"<[^>]*>", " ", quoted[1]).split()) if quoted else ""
+    words = re.sub(r"<[^>]*>", " ", quoted[1]) if quoted else ""
     # Control characters would reach the terminal.
-    shown = "".join(character if character.isprintable() else " " for character in words[:200])
-    return f": {redact(shown)}" if shown else ""
+    shown = "".join(character if character.isprintable() else " " for character in words)
+    return f": {redact(' '.join(shown.split())[:200])}" if shown.strip() else ""
 
 
 def redacted_line(error: BaseException) -> str:
