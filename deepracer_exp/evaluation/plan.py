@@ -27,7 +27,7 @@ class EvaluatePlan:
     run: StoredRun
     """The run, with its checkpoint."""
     config: EvaluateConfig
-    """Its protocol is the one that was named; if none was, that by which the training evaluated, with the changes."""
+    """The request. Unless a protocol was named, it has that by which the training evaluated, with the changes."""
     rival: StoredRun | None = None
     """The run, with its checkpoint, that drives the rival; None: there is none, or it is the policy itself."""
 
