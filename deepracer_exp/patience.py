@@ -61,6 +61,7 @@ class Silence:
     Attributes:
         computed_s: seconds of CPU that the processes used meanwhile, at most those of the clock.
         idle_s: seconds of the clock in which they used none, and did not wait for a core either.
+        clock_s: seconds of the clock, whatever they did.
     """
 
     def __init__(self) -> None:
@@ -69,13 +70,14 @@ class Silence:
 
     def restart(self) -> None:
         """Count again, from the next look: what was waited for has come."""
-        self.computed_s = self.idle_s = 0.0
+        self.computed_s = self.idle_s = self.clock_s = 0.0
         self._seen: tuple[Use, float] | None = None
 
     def look(self, use: Use, now_s: float) -> float:
         """Return the seconds counted so far; `now_s` is by the monotonic clock."""
         if self._seen is not None:
             before, looked_s = self._seen
+            self.clock_s += now_s - looked_s
             used_s = use.cpu_s - before.cpu_s  # below 0 if a child is gone
             if abs(used_s) > _IDLE_SHARE * (now_s - looked_s):
                 self.computed_s += min(max(used_s, 0.0), now_s - looked_s)

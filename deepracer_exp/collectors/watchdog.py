@@ -1,6 +1,7 @@
 """Detects worker processes that die, and detects and ends those that hang."""
 
 import contextlib
+import logging
 import multiprocessing
 import threading
 import time
@@ -18,6 +19,9 @@ from deepracer_exp.patience import LOOK_EVERY_S, Silence, Use, use_of, use_of_th
 # A hang before the first step has no other sign. Building the cars takes 2 s; the first start after an installation
 # compiles as well, for half a minute.
 _START_TIMEOUT_S = 120.0
+_SAY_EVERY_S = 60.0
+
+_log = logging.getLogger(__name__)
 
 
 class Watchdog:
@@ -90,7 +94,7 @@ class Watchdog:
 
     def _watch(self) -> None:
         seen = np.array(self._beats)
-        silences = [Silence() for _ in seen]
+        silences, said_s = [Silence() for _ in seen], 0.0
         while not self._over.wait(LOOK_EVERY_S):
             beats = np.array(self._beats)
             is_silent = (beats == seen) & ~self._delivered & self._waiting.is_set()
@@ -104,6 +108,17 @@ class Watchdog:
                 silent_s = silence.look(of_all or use_of(self._pids[worker]), time.monotonic())
                 if silent_s > (self._timeout_s if beats[worker] > 0 else self._start_timeout_s):
                     self._end(worker, silence, int(beats[worker]))
+            longest = max(silences, key=lambda silence: silence.clock_s)
+            said_s = min(said_s, longest.clock_s)
+            if longest.clock_s >= said_s + _SAY_EVERY_S:
+                said_s = longest.clock_s
+                worker = silences.index(longest)
+                _log.warning(
+                    "collector worker %d has taken no step for %.0f s and is waited for: %s",
+                    worker,
+                    said_s,
+                    longest,
+                )
 
     def _end(self, worker: int, silence: Silence, steps: int) -> None:
         is_first = worker in self.verdict

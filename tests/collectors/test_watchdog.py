@@ -91,6 +91,19 @@ def test_a_worker_that_delivered_one_batch_must_step_for_the_next(watch, beats):
     assert list(dog.verdict) == [0]
 
 
+def test_a_worker_that_is_waited_for_is_named_now_and_then(watch, beats, monkeypatch, caplog):
+    monkeypatch.setattr(watchdog, "_SAY_EVERY_S", 0.2)
+    dog = watch(600.0)
+    counters = beats()
+    counters[:] = 1
+    dog.expect()
+    dog.delivered(0)
+    wait_until(lambda: len(caplog.records) > 2, "lines")
+    assert {record.args[0] for record in caplog.records} == {1}
+    assert "collector worker 1 has taken no step for " in caplog.text
+    assert not dog.verdict
+
+
 def test_no_worker_is_ended_while_none_is_waited_for(watch, beats, processes):
     dog = watch()
     beats()[:] = 1
