@@ -3,6 +3,7 @@
 import logging
 import re
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -18,6 +19,8 @@ CALL_S = 120.0
 
 The time limit of an HTTP request is one for the pause between two bytes: a server that sends one now and then would
 hold it for ever."""
+LISTING_S = 300.0
+"""Longest wait for all pages of a listing together: a server could give one a minute for ever."""
 _SAY_AFTER_S = 10.0
 _log = logging.getLogger(__name__)
 _WORTH_RETRYING = (408, 425, 429)
@@ -153,9 +156,15 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
 
 
 def pages(search: Callable[..., Any], **what: Any) -> Iterator[Any]:
-    """Return the results of one of the client's searches, from all pages."""
-    token = None
+    """Return the results of one of the client's searches, from all pages.
+
+    Raises:
+        TimeoutError: they took too long together.
+    """
+    token, end_by = None, time.monotonic() + LISTING_S
     while True:
+        if token and time.monotonic() > end_by:
+            raise TimeoutError(f"its list has no end after {LISTING_S:.0f} s")
         page = search(**what, page_token=token)
         yield from page
         token = page.token

@@ -25,6 +25,7 @@ from .calls import (
     BoundedClient,
     StoreRefusedError,
     StoreUnavailableError,
+    ended_within,
     store_errors,
 )
 

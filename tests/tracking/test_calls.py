@@ -5,6 +5,7 @@ from functools import partialmethod
 
 import pytest
 from mlflow.environment_variables import MLFLOW_HTTP_REQUEST_TIMEOUT
+from mlflow.store.entities import PagedList
 
 from deepracer_exp.tracking import calls
 from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
@@ -95,3 +96,10 @@ def test_what_a_training_could_not_record_is_its_last_lines_and_is_sent_by_their
     sent = call("runs", "send", word, f"tracking.uri={server.uri}")
     assert sent.code == 0, sent.stderr
     assert sent.stdout.startswith(f"{name}: sent, with ")
+
+
+def test_a_list_without_an_end_is_given_up(monkeypatch):
+    monkeypatch.setattr(calls, "LISTING_S", 0.0)
+    endless = PagedList(["a run"], token="more")
+    with pytest.raises(TimeoutError, match="its list has no end"):
+        list(calls.pages(lambda page_token: endless))
