@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from statistics import NormalDist
 from typing import Any
 
@@ -10,140 +9,36 @@ import numpy as np
 
 from deepracer_exp.errors import count
 from deepracer_exp.runs.result import RunResult
-from deepracer_exp.stopping.judge import POOR, convergence, convergence_rule, overfitting
 
 from . import off_track
 from .beside import raced_beside
-from .log_view import LEAST_EPISODES, LEAST_LAPS, LogView, thirds
+from .finding import WORTH_PERCENT, WORTH_S, Finding, Numbers, in_order
+from .log_view import LEAST_LAPS, LogView, thirds
 from .off_track import JUDGEMENTS, OffTrackPlace, off_track_places
 from .others import costliest
 from .sectors import Sector, sector_at, sectors_now, sectors_of
-from .slower_laps import CHANCE, LEAST_TIMES, SLOWER, slower_laps
 from .statistics import wilson
 from .step_columns import begins_of, first_rows
 from .tables import CANDIDATE_LAPS, DENSE
-from .zigzag import CURE, ZIGZAG_DEG, ZIGZAG_PER_M, zigzag_in_words, zigzag_now
+from .training_findings import training_findings
+from .zigzag import CONSOLE_CURE, CURE, ZIGZAG_DEG, ZIGZAG_PER_M, zigzag_in_words, zigzag_now
 
 CRASH_PLACE_M = 1.0
 """Crashes no further than this from one place are at one object."""
 MOST_LOST = 3
-WORTH_S = 0.02
-"""Time lost in a sector from which on it is mentioned."""
-FIGURES = {
-    "converged": "training_progress",
-    "submit": "lap_time_percentile",
-    "chance": "lap_time_histogram",
-    "time_lost": "sector_times",
-    "crashes": "episode_ends_map",
-    "costs_most": "crashes_by_object",
-    "runs_off": "off_track_risk",
-    "steering": "slide_map",
-    "zigzag": "zigzag",
-    "overfits": "training_progress",
-    "laps_slower": "training_progress",
-}
-"""The chart that shows what a rule found."""
-_Numbers = dict[str, float | int | str]
-
-
-@dataclass(frozen=True)
-class Finding:
-    """A finding of a log."""
-
-    rule: str
-    sentence: str
-    """The finding in plain words, one to three sentences."""
-    values: Mapping[str, float | int | str] = field(default_factory=dict)
-    """The numbers that were compared."""
-    thresholds: Mapping[str, float | int] = field(default_factory=dict)
-
-    @property
-    def figure(self) -> str:
-        """Name of the chart that shows it."""
-        return FIGURES[self.rule]
 
 
 def findings(view: LogView, target_s: float | None = None) -> list[Finding]:
-    """Apply all rules to a log, the most important findings first; `target_s`: the lap time wanted, if there is one."""
-    results, overfits = list[Finding | None](), None
-    if view.trained:
-        overfits = _overfits(view)
-        results += [_converged(view, overfits), _submit(view), _laps_slower(view)]
-    results += [_chance(view, target_s), _time_lost(view)]
+    """Apply all rules to a log; what to do is first, then what costs most (`finding.in_order`).
+
+    `target_s` is the lap time wanted, if there is one.
+    """
+    of_training = training_findings(view, _submit(view)) if view.trained else []
+    of_driving = [_time_lost(view)]
     if not view.laps_only:
-        results += [_crashes(view), _costliest(view), *_runs_off(view)]
-    results += [_zigzag(view), overfits]
-    return [finding for finding in results if finding is not None]
-
-
-def _converged(view: LogView, overfits: Finding | None) -> Finding:
-    decision = view.decision
-    if decision is not None:
-        return _decided(decision)
-    converged = convergence(view.judged, view.action_count, view.stopping)
-    rule = convergence_rule(view.stopping)
-    if converged is None:
-        driven = int((view.judged["episodes"] > 0).sum())
-        sentence = (
-            f"Too short to say whether the training has converged: {_of(driven, view)}, and at least "
-            f"{rule.patience + 1} are needed."
-        )
-        return Finding("converged", sentence, {"iterations": driven})
-    keep = "" if overfits is not None and overfits.values["overfits"] else " Keep training."
-    values: _Numbers = {
-        "completion": converged.completion,
-        "completion_before": converged.completion_before,
-        "completion_best": converged.completion_best,
-        "patience": converged.patience,
-    }
-    if converged.entropy_change is not None:
-        values["entropy_change"] = converged.entropy_change
-    if converged.iteration is not None:
-        values["iteration"] = converged.iteration
-        sentence = (
-            f"Converged at iteration {converged.iteration}: since then completion ({converged.completion:.0f}%), "
-            "reward and complete laps have not grown."
-        )
-        if converged.completion < POOR:
-            sentence += (
-                " That is far from a lap: change reward, action space or learning rate, do not train longer."
-            )
-    elif converged.completion < converged.completion_best - rule.completion_near:
-        sentence = (
-            f"Not converged: completion fell back from {converged.completion_best:.0f} to {converged.completion:.0f}%. "
-            f"Lower the learning rate, or take {_instead(view)}."
-        )
-    elif converged.completion > converged.completion_before + rule.completion_gain:
-        sentence = (
-            f"Not converged yet: completion grew from {converged.completion_before:.0f} to {converged.completion:.0f}% "
-            f"in the last {_of(converged.patience, view)}.{keep}"
-        )
-    else:
-        what = "reward or complete laps still grow" if converged.entropy_flat else "the entropy still changes"
-        sentence = f"Not converged yet: completion is {converged.completion:.0f}%, but {what}.{keep}"
-    thresholds = {
-        "completion_gain": rule.completion_gain,
-        "reward_gain": rule.return_gain,
-        "laps_gain": rule.laps_gain,
-        "completion_near": rule.completion_near,
-        "entropy_change": rule.entropy_change,
-    }
-    return Finding("converged", sentence, values, thresholds)
-
-
-def _of(number: int, view: LogView) -> str:
-    """Return so many rows of `view.judged` in words."""
-    if not view.in_blocks:
-        return count(number, "iteration")
-    return f"{count(number, 'block')} of {LEAST_EPISODES} or more episodes"
-
-
-def _decided(decision: Mapping[str, Any]) -> Finding:
-    """Report the decision of the run's own stopping rule: whatever else the log shows, that is why it ended."""
-    rule = str(decision["rule"]).replace("_", " ")
-    sentence = f"The run's stopping rule ended it ({rule}): {decision['why']}."
-    limits = {key: limit for key, limit in decision["thresholds"].items() if isinstance(limit, int | float)}
-    return Finding("converged", sentence, decision["values"], limits)
+        of_driving += [_crashes(view), _costliest(view), *_runs_off(view)]
+    of_driving += [_zigzag(view), _chance(view, target_s)]
+    return in_order(of_training, [finding for finding in of_driving if finding is not None])
 
 
 def _race_with(best: RunResult) -> Finding:
@@ -152,9 +47,10 @@ def _race_with(best: RunResult) -> Finding:
         sentence = (
             "No checkpoint was evaluated: `deepracer-exp checkpoints RUN` races the ones that were kept."
         )
-        return Finding("submit", sentence)
-    sentence = f"Race with checkpoint {best.iteration:06d}, the best by {best.criterion}: {best.words()}."
-    return Finding("submit", sentence, {"iteration": best.iteration, "by": best.criterion})
+        return Finding("submit", sentence, to_do=sentence)
+    which = f"checkpoint {best.iteration:06d}, the best by {best.criterion}: {best.words()}."
+    values: Numbers = {"iteration": best.iteration, "by": best.criterion}
+    return Finding("submit", f"The best so far is {which}", values, to_do=f"Race with {which}")
 
 
 def _submit(view: LogView) -> Finding:
@@ -166,7 +62,7 @@ def _submit(view: LogView) -> Finding:
         return _nothing_to_submit(view, thresholds)
     first = best.iloc[0]
     complete, episodes = int(first["complete"]), int(first["episodes"])
-    values: _Numbers = {
+    values: Numbers = {
         "iteration": int(first["iteration"]),
         "laps": complete,
         "lap_share": first["lap_share"],
@@ -176,8 +72,8 @@ def _submit(view: LogView) -> Finding:
         if complete == episodes:
             completed = {1: "its lap", 2: "both laps"}.get(episodes, f"all {episodes} laps")
         average = "" if complete == 1 else " on average"
-        sentence = (
-            f"Submit {_checkpoint(view, first['checkpoint'])} iteration {first['iteration']}: its evaluation completed "
+        which = (
+            f"{_checkpoint(view, first['checkpoint'])} iteration {first['iteration']}: its evaluation completed "
             f"{completed}, in {first['lap_time_mean_s']:.2f} s{average}. The evaluations of the log decide: they race "
             "without exploring."
         )
@@ -186,8 +82,8 @@ def _submit(view: LogView) -> Finding:
     else:
         low, high = map(float, wilson(complete, episodes))
         whose = "their" if view.in_blocks else "its"
-        sentence = (
-            f"Submit {_checkpoint(view, first['checkpoint'])} {_iterations(view, first['iteration'])}: a quarter of "
+        which = (
+            f"{_checkpoint(view, first['checkpoint'])} {_iterations(view, first['iteration'])}: a quarter of "
             f"{whose} exploring laps are below {first['lap_time_p25_s']:.2f} s, and {complete} of {whose} {episodes} "
             f"episodes are complete laps ({_share(low)} to {_share(high)} with 95% confidence)."
         )
@@ -199,8 +95,8 @@ def _submit(view: LogView) -> Finding:
         for row in best.iloc[1:].to_dict("records")
     ]
     if others:
-        sentence += f" After it: {' and '.join(others)}."
-    return Finding("submit", sentence, values, thresholds)
+        which += f" After it: {' and '.join(others)}."
+    return Finding("submit", f"The best so far is {which}", values, thresholds, to_do=f"Submit {which}")
 
 
 def _nothing_to_submit(view: LogView, thresholds: Mapping[str, float]) -> Finding:
@@ -267,7 +163,7 @@ def _chance(view: LogView, target_s: float | None) -> Finding | None:
     if view.laps_only:
         share = "Other episodes are not in the trace (trace=laps)."
     driven = count(laps, f"complete {view.lap_word}")
-    values: _Numbers = {"laps": laps, "best_s": best_s, "mean_s": mean_s, "complete": complete, "sd_s": sd_s}
+    values: Numbers = {"laps": laps, "best_s": best_s, "mean_s": mean_s, "complete": complete, "sd_s": sd_s}
     if target_s is None:
         p25_s, median_s = (float(quantile) for quantile in np.quantile(laps_s, [0.25, 0.5]))
         sentence = (
@@ -298,29 +194,28 @@ def _time_lost(view: LogView) -> Finding | None:
     sectors = {part.name: part for part in parts}
     lost = (times.median() - times.min()).sort_values(ascending=False, kind="stable").head(MOST_LOST)
     lost = lost[lost >= WORTH_S]
+    if not len(lost):
+        return None
     best_s, possible_s = float(times.sum(axis=1).min()), float(times.min().sum())
     places = [
         f"{name} (waypoints {sectors[name].first_waypoint} to {sectors[name].last_waypoint}): {seconds:.2f} s"
         for name, seconds in lost.items()
     ]
-    where = (
-        f"Compared with the best time of each sector, the median loses most in {'; '.join(places)}"
-        if places
-        else "No sector loses time to its best"
-    )
     starts = view.episodes.loc[times.index, "start_at"]
     begun = np.searchsorted([part.first_waypoint for part in parts], starts, side="right")
     # Where laps begin in different sectors, the best time of each is that of a car at speed.
     standing = " without a standing start" if len(set(begun)) > 1 else ""
     sentence = (
         f"The best sectors of {count(len(times), view.lap_word)} {when} add up to {possible_s:.2f} s{standing}; the "
-        f"fastest of them took {best_s:.2f} s. {where}."
+        f"fastest of them took {best_s:.2f} s. Compared with the best time of each sector, the median loses most in "
+        f"{'; '.join(places)}."
     )
     if len(times) < LEAST_LAPS:
         sentence += f" From {len(times)} laps this is a hint at most."
     values = {"best_lap_s": best_s, "theoretical_best_s": possible_s}
     values |= {f"lost_s, {name}": float(seconds) for name, seconds in lost.items()}
-    return Finding("time_lost", sentence, values, {"worth_s": WORTH_S})
+    cost = 100 * float(lost.sum()) / float(times.sum(axis=1).median())
+    return Finding("time_lost", sentence, values, {"worth_s": WORTH_S}, cost)
 
 
 def _costliest(view: LogView) -> Finding | None:
@@ -333,7 +228,10 @@ def _costliest(view: LogView) -> Finding | None:
         return None
     sentence, values = costs_most
     when = "last third of the iterations" if view.trained else "evaluations"
-    return Finding("costs_most", f"In the {when}: {sentence}", values)
+    driven = view.steps["episode"][late].nunique()
+    return Finding(
+        "costs_most", f"In the {when}: {sentence}", values, cost_percent=100 * int(values["crashes"]) / driven
+    )
 
 
 def _crashes(view: LogView) -> Finding | None:
@@ -361,6 +259,7 @@ def _crashes(view: LogView) -> Finding | None:
         f"The car crashed in {crashed} of {count(len(episodes), 'episode')}{view.traced}{where}",
         {"crashed": crashed, "episodes": len(episodes), "here": len(here), "waypoint": waypoint},
         {"place_m": CRASH_PLACE_M, "least": off_track.LEAST},
+        100 * crashed / len(episodes),
     )
 
 
@@ -372,9 +271,11 @@ def _runs_off(view: LogView) -> list[Finding]:
     places = off_track_places(steps)
     if not places:
         times = len(off_track.off_track_rows(steps))
+        if not times:
+            return []
         words = {1: "once", 2: "twice"}.get(times, f"{times} times")
-        often = f"runs off the road {words}, in no place often" if times else "does not run off the road"
-        return [Finding("runs_off", f"The car {often} {when}.", {"times": times}, thresholds)]
+        sentence = f"The car runs off the road {words}, in no place often {when}."
+        return [Finding("runs_off", sentence, {"times": times}, thresholds, 100 * times / len(late))]
     sectors = sectors_of(view.course) if view.course is not None else []
     where = [
         f"at waypoint {place.waypoint}{_in(sectors, place)} to the {place.side} "
@@ -384,10 +285,11 @@ def _runs_off(view: LogView) -> list[Finding]:
     sentence = f"The car runs off most often {', then '.join(where)}, counted {when}."
     values = {f"risk, waypoint {place.waypoint}": place.count / place.passes for place in places}
     values |= {f"times, waypoint {place.waypoint}": place.count for place in places}
-    return [Finding("runs_off", sentence, values, thresholds), _steering(places)]
+    cost = 100 * sum(place.count for place in places) / len(late)
+    return [Finding("runs_off", sentence, values, thresholds, cost), _steering(places, cost)]
 
 
-def _steering(places: Sequence[OffTrackPlace]) -> Finding:
+def _steering(places: Sequence[OffTrackPlace], cost: float) -> Finding:
     # A mistake made at several places is mentioned once.
     waypoints: dict[str, list[str]] = {}
     for place in places:
@@ -405,66 +307,25 @@ def _steering(places: Sequence[OffTrackPlace]) -> Finding:
     }
     thresholds = {"unusual": off_track.UNUSUAL, "slide_deg": off_track.SLIDE_DEG}
     thresholds |= {"steers_deg": off_track.STEERS_DEG}
-    return Finding("steering", f"Before it runs off, {'; '.join(words)}.", values, thresholds)
+    return Finding("steering", f"Before it runs off, {'; '.join(words)}.", values, thresholds, cost)
 
 
 def _zigzag(view: LogView) -> Finding | None:
     figures, where = zigzag_now(view)
-    if figures is None or figures[0] < ZIGZAG_PER_M or not figures[1] >= ZIGZAG_DEG:
+    if figures is None or figures[0] < ZIGZAG_PER_M or not figures[1] >= ZIGZAG_DEG or figures[2] < WORTH_S:
         return None
-    sentence = f"The car zig-zags on straights: {zigzag_in_words(*figures)} lost in the detour ({where}). Try {CURE}."
+    cure = CONSOLE_CURE if view.run is None else CURE
+    sentence = f"The car zig-zags on straights: {zigzag_in_words(*figures)} lost in the detour ({where}). Try {cure}."
     values = dict(zip(("changes_per_m", "amplitude_deg", "lost_s"), figures, strict=True))
-    return Finding("zigzag", sentence, values, {"changes_per_m": ZIGZAG_PER_M, "amplitude_deg": ZIGZAG_DEG})
+    thresholds = {"changes_per_m": ZIGZAG_PER_M, "amplitude_deg": ZIGZAG_DEG, "lost_s": WORTH_S}
+    lap_s = float(view.now(LEAST_LAPS)[0]["lap_time_s"].median())
+    # Without a lap there is nothing to compare with: it is mentioned after all that has a cost in per cent.
+    cost = WORTH_PERCENT if math.isnan(lap_s) else max(WORTH_PERCENT, 100 * figures[2] / lap_s)
+    return Finding("zigzag", sentence, values, thresholds, cost)
 
 
 def _in(sectors: Sequence[Sector], place: OffTrackPlace) -> str:
     return f" ({sectors[sector_at(sectors, np.array([place.lap_position]))[0]].name})" if sectors else ""
-
-
-def _overfits(view: LogView) -> Finding | None:
-    decision = view.decision
-    judged = overfitting(view.judged, view.stopping)
-    if judged is None or (decision is not None and decision["rule"] == "overfitting"):  # reported already
-        return None
-    values: _Numbers = {"best": judged.best, "now": judged.now, "best_iteration": judged.best_iteration}
-    values["overfits"] = int(judged.decision is not None)
-    sentence = (
-        f"No sign of overfitting: the mean completion of the last three {judged.evaluated}s is {judged.now:.0f}% "
-        f"(best three in a row: {judged.best:.0f}%)."
-    )
-    if judged.decision is not None:
-        sentence = (
-            f"It overfits: the mean completion of three {judged.evaluated}s in a row fell from {judged.best:.0f}% "
-            f"around iteration {judged.best_iteration} to {judged.now:.0f}% while the reward of the training holds. "
-            f"Take {_instead(view)}."
-        )
-        values |= judged.decision.values
-    thresholds = {"held_out_drop": judged.rule.held_out_drop, "return_drop": judged.rule.return_drop}
-    return Finding("overfits", sentence, values, thresholds | {"patience": judged.rule.patience})
-
-
-def _laps_slower(view: LogView) -> Finding | None:
-    decision = view.decision
-    slower = slower_laps(view.judged)
-    if slower is None or (decision is not None and decision["rule"] == "laps_slower"):  # reported already
-        return None
-    values: _Numbers = {"iteration": slower.since, "fastest_s": slower.fastest_s, "now_s": slower.now_s}
-    values |= {"return_then": slower.return_then, "return_now": slower.return_now}
-    thresholds = {"slower": SLOWER, "chance": CHANCE, "least_lap_times": LEAST_TIMES}
-    return Finding("laps_slower", f"{slower} Take {_instead(view)}.", values, thresholds)
-
-
-def _instead(view: LogView) -> str:
-    """Return which checkpoint to take instead of the last: the one that `_submit` names."""
-    if view.run is not None:
-        best = view.run.best
-        if best.iteration is None:
-            return "one of the kept checkpoints"
-        return f"checkpoint {best.iteration:06d} (the best by {best.criterion})"
-    if not len(view.candidates):
-        return "an earlier checkpoint"
-    first = view.candidates.iloc[0]
-    return f"the checkpoint {first['checkpoint']}" if first["checkpoint"] else "the checkpoint to submit"
 
 
 def _share(share: float) -> str:

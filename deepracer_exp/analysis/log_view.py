@@ -14,6 +14,7 @@ from deepracer_exp.aws.models.hyperparameters import Hyperparameters
 from deepracer_exp.env.placement import PlacedOthers, box_corners_of, rebuild_poses
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.recording import EvaluationRecording, RunRecording
+from deepracer_exp.stopping.judge import Convergence, convergence
 from deepracer_exp.tracks.track import Track
 
 from .log_course import (
@@ -153,6 +154,16 @@ class LogView:
         have evaluated them.
         """
         return candidates(self.recording, self.judged).iloc[: None if self.run is None else 0]
+
+    @cached_property
+    def convergence(self) -> Convergence | None:
+        """Since when the training has not grown; None where it is too short to say, or a stopping rule has decided.
+
+        Findings and figures quote this.
+        """
+        if self.decision is not None:
+            return None
+        return convergence(self.judged, self.action_count, self.stopping)
 
     @property
     def waypoint_count(self) -> int:

@@ -38,6 +38,9 @@ CURE = (
     "an action space with smaller angles; algorithm.smoothness=0.02 helps some trainings (docs/smoothness.md)"
 )
 
+CONSOLE_CURE = "smaller steering angles in the action space"
+"""The same for a training of the service."""
+
 Figures = tuple[float, float, float]
 """`changes_per_m`, `amplitude_deg` (NaN without a change) and `lost_s` of a `ZigZag`."""
 

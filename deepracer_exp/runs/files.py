@@ -140,6 +140,12 @@ def sees_pictures(config: Mapping[str, Any]) -> bool:
     return bool((config.get("observation") or {}).get("camera"))
 
 
+def is_randomized(config: Mapping[str, Any]) -> bool:
+    """Return whether a run's configuration varies the conditions of its training."""
+    ranges = (config.get("randomization") or {}).values()
+    return any(isinstance(bounds, list) and bounds[0] != bounds[-1] for bounds in ranges)
+
+
 def read_object(file: Path) -> dict[str, Any]:
     """Read a JSON object of a run's folder; empty where there is no such file.
 

@@ -34,7 +34,18 @@ from deepracer_exp.env.trace import EPISODE_STATUS, SCHEMA
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import RECORD_BYTES, read_text
 
-from .files import CONFIG, METRICS, REWARD, SUMMARY, TRACE, WRITTEN, is_run, read_config, read_object
+from .files import (
+    CONFIG,
+    METRICS,
+    REWARD,
+    SUMMARY,
+    TRACE,
+    WRITTEN,
+    is_randomized,
+    is_run,
+    read_config,
+    read_object,
+)
 from .result import IN_TRAINING, RunResult, read_result
 from .trace import (
     UNREADABLE,
@@ -58,6 +69,8 @@ EVALUATION_COLUMNS: Mapping[str, tuple[str, str]] = {
         "the same on conditions held out of the training; NaN where not evaluated",
     ),
     "lap_share": ("float64", "complete laps as a share of those tried; NaN where not known"),
+    "laps": ("float64", "complete laps; NaN where not known"),
+    "laps_tried": ("float64", "laps tried; NaN where not known"),
     "lap_time_s": ("float64", "s, mean of the complete laps; NaN without one"),
     "crash_free": (
         "float64",
@@ -102,6 +115,8 @@ class RunRecording:
     """The run's group `stopping`; None where its configuration cannot be read."""
     decision: Mapping[str, Any] | None = None
     """The decision of the stopping rule that ended the run, as in summary.json; None if no rule did."""
+    randomized: bool = False
+    """Whether its training varied the conditions (`randomization`)."""
     counted: pd.DataFrame | None = None
     """Results of all episodes by iteration, `COUNTED_COLUMNS`, where the trace has complete laps only."""
     others: PlacedOthers | None = None
@@ -172,6 +187,7 @@ def read_run_recording(folder: Path) -> RunRecording:
         evaluations=evaluated,
         stopping=config.get("stopping"),
         decision=_decision(folder),
+        randomized=is_randomized(config),
         counted=counted if laps_only else None,
         others=_others(folder, config, problems),
     )

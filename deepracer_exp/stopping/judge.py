@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import TypeAdapter, ValidationError
 
 from deepracer_exp.config.stopping import ConvergedRule, EntropyStopping, OverfittingRule, StoppingConfig
+from deepracer_exp.runs.result import RELIABLE
 
 from .rules import Decision, Row, TrendRule
 
@@ -26,12 +27,14 @@ LOG_RULE = ConvergedRule(
     return_gain=0.05,
     laps_gain=0.05,
     entropy_change=0.1,
-    best_patience=60,
+    best_patience=10,
     best_gain=0.01,
 )
 """The values of `conf/stopping/entropy.yaml`, with the warm-up and patience that suit the shorter logs of others."""
 PATIENCE_SHARE = 0.2
 """Share of all iterations of such a log that must be without growth."""
+_WINDOW = 3
+"""Iterations of the moving averages."""
 POOR = 50.0
 """Completion below which a training that no longer grows has not learned to drive, per cent."""
 LOG_OVERFITTING = OverfittingRule(warmup=0, patience=3, held_out_drop=10.0, return_drop=0.05)
@@ -66,20 +69,19 @@ def convergence(
     convergence would have ended it.
 
     Args:
-        iterations: a row each, with `episodes`, `steps`, `completion_mean`, `reward_mean`, `lap_share` and `entropy`.
+        iterations: a row each, with `episodes`, `steps`, `completion_mean`, `reward_mean`, `lap_share`, `entropy`,
+            `eval_lap_share` and `eval_lap_time_s`.
         action_count: of a discrete policy, None of a continuous one.
         stopping: of a run of ours, its group `stopping`, whose rule of convergence is applied if it has one; None:
             LOG_RULE.
     """
     table = iterations[iterations["episodes"] > 0]
-    rule = replace(convergence_rule(stopping), warmup=0)
-    if rule == LOG_RULE:
-        rule = replace(rule, patience=max(rule.patience, math.ceil(PATIENCE_SHARE * len(table))))
+    rule = _rule_for(table, stopping)
+    if len(table) < rule.patience + _WINDOW:
+        return None
     judge = TrendRule(_only(converged=rule), action_count)
     ends = [judge.observe(row) is not None for row in _rows(table)]
     completion = judge.averages["completion"]
-    if not completion.reaches_back(rule.patience):
-        return None
     going = len(ends) - (ends[::-1].index(False) if False in ends else len(ends))
     before, _ = completion.bests(rule.patience)
     change = judge.averages["entropy"].change(rule.patience)
@@ -92,6 +94,20 @@ def convergence(
         entropy_flat=(change or 0.0) <= rule.entropy_change,
         patience=rule.patience,
     )
+
+
+def iterations_needed(iterations: "pd.DataFrame", stopping: Mapping[str, Any] | None = None) -> int:
+    """Return from how many iterations with an episode on `convergence` says something; arguments as there."""
+    return _rule_for(iterations[iterations["episodes"] > 0], stopping).patience + _WINDOW
+
+
+def _rule_for(table: "pd.DataFrame", stopping: Mapping[str, Any] | None) -> ConvergedRule:
+    """Return the rule by which a table of iterations with episodes is judged."""
+    rule = replace(convergence_rule(stopping), warmup=0)
+    if rule != LOG_RULE:
+        return rule
+    patience = max(rule.patience, math.ceil(PATIENCE_SHARE * len(table)))
+    return replace(rule, patience=patience, best_patience=patience)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,7 +165,7 @@ def _only(
 ) -> EntropyStopping:
     return EntropyStopping(
         kind="entropy",
-        window=3,
+        window=_WINDOW,
         converged=converged,
         overfitting=overfitting,
         collapsed=None,
@@ -161,7 +177,10 @@ def _only(
 def _rows(iterations: "pd.DataFrame") -> Iterator[Row]:
     """Return iterations as the rows of a training, as far as the rules of trends look at them."""
     laps = (iterations["lap_share"] * iterations["episodes"]).fillna(0.0).cumsum()
+    reliable = iterations["eval_lap_share"] >= RELIABLE
     table = {
+        # The race score is in the metrics of our own runs alone.
+        "eval_race_score_s": iterations["eval_lap_time_s"].where(reliable),
         "completion": iterations["completion_mean"],
         "mean_return": iterations["reward_mean"],
         "entropy": iterations["entropy"],

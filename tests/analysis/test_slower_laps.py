@@ -185,7 +185,7 @@ def test_a_rule_that_ended_the_run_for_it_is_reported_once() -> None:
     decision = {"rule": "laps_slower", "why": "slower", "values": {}, "thresholds": {}}
     found = findings(own(SLOWED_S, decision=decision))
     assert [one.rule for one in found].count("laps_slower") == 0
-    assert "The run's stopping rule ended it (laps slower): slower." in [one.sentence for one in found]
+    assert found[0].sentence.startswith("The run's stopping rule ended it (laps slower): slower. The reward")
 
 
 def test_the_chart_shows_evaluated_and_exploring_laps_apart() -> None:

@@ -8,7 +8,6 @@ import pandas as pd
 
 from deepracer_exp.analysis.log_view import LogView
 from deepracer_exp.analysis.statistics import MOST_ROWS, histogram, moving_average, quantiles, subsample
-from deepracer_exp.stopping.judge import convergence
 
 from .figure import Chart, Layer, Panel, band, bars, in_rows, line, mark, points
 from .style import BLUE, FAINT, GREEN, ORANGE, PURPLE, SKY, VERMILION
@@ -19,13 +18,18 @@ _HEALTHY_MS, _TOO_LONG_MS = 1000 / 15, 90.0
 
 
 def training_progress(view: LogView) -> Chart | None:
-    """Draw reward, progress, complete laps, lap times and entropy by iteration, and where the training converged."""
-    table = view.iterations
+    """Draw reward, progress, complete laps, lap times and entropy by iteration.
+
+    It shows where the training converged, or the checkpoint that its own evaluations found best.
+    """
+    table, verdict = view.iterations, view.convergence
     if not len(table):
         return None
-    verdict = convergence(view.judged, view.action_count, view.stopping)
     iteration = None if verdict is None else verdict.iteration
-    converged = [] if iteration is None else [mark(iteration, "converged", FAINT)]
+    marks = [] if iteration is None else [mark(iteration, "converged", FAINT)]
+    best = None if view.run is None else view.run.best.iteration
+    if best is not None:
+        marks.append(mark(best, "best checkpoint", GREEN))
     progress = curve_layers(table, "completion_mean", BLUE, "mean of the episodes")
     for column, color, name in (
         ("eval_completion", ORANGE, "evaluation"),
@@ -56,7 +60,7 @@ def training_progress(view: LogView) -> Chart | None:
         )
     when = "It has not converged yet." if iteration is None else f"It converged at iteration {iteration}."
     if view.decision is not None:
-        when = "The run's stopping rule ended it."
+        when = f"The run's stopping rule ended it at iteration {table['iteration'].max()}."
     elif verdict is None:
         when = "It is too short to say whether it has converged."
     return Chart(
@@ -64,7 +68,7 @@ def training_progress(view: LogView) -> Chart | None:
         title="Training progress",
         caption="Points are iterations, lines their moving average of three: reward and progress should rise "
         f"together while entropy falls. {when}",
-        rows=in_rows([_over_iterations(title, unit, [*layers, *converged]) for title, unit, layers in shown]),
+        rows=in_rows([_over_iterations(title, unit, [*layers, *marks]) for title, unit, layers in shown]),
         share_x=True,
     )
 
