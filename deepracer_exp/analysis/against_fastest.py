@@ -136,6 +136,18 @@ def _way_m(points: Values) -> Values:
     return np.r_[0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T))]
 
 
+def fastest_in_words(view: LogView, folder: Path) -> str:
+    """Return the fastest lap that was found of a run's car on the track, with its bound, or how it is found."""
+    try:
+        question = question_of(view, folder)
+    except BadInput as error:
+        return f"none: {error}"
+    fastest = None if question is None else kept_lap(question)
+    if fastest is None:
+        return f"not searched yet: deepracer-exp analyze {folder.name} --fastest"
+    return f"{fastest.lap_time_s:.2f} s; none is faster than {fastest.bound_s:.2f} s"
+
+
 def loss_in_words(view: LogView, folder: Path) -> str:
     """Return what a run's lap loses to the fastest lap of its car, or how that is found out."""
     try:

@@ -3,9 +3,9 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-WORTH_S = 0.05
-"""Seconds a lap below which a loss is not worth a racer's time."""
-WORTH_PERCENT = 1.0
+LEAST_LOSS_S = 0.05
+"""Seconds a lap below which a loss is not mentioned."""
+LEAST_LOSS_PERCENT = 1.0
 """The same in per cent, of completion, of laps that fail, or of the lap time."""
 FIGURES = {
     "converged": "training_progress",
@@ -52,14 +52,14 @@ def in_order(of_training: Sequence[Finding], of_driving: Sequence[Finding]) -> l
 
     What to do is that of the costliest finding of the training, or of the first of these where none costs anything. The
     others do not say theirs: a racer can do one thing at a time, and it may be the opposite. A finding that costs
-    something, but less than `WORTH_PERCENT`, is left out.
+    something, but less than `LEAST_LOSS_PERCENT`, is left out.
     """
     to_do = [finding for finding in of_training if finding.to_do]
     first = max(to_do, key=lambda finding: finding.cost_percent, default=None)
     others = [
         finding
         for finding in (*of_training, *of_driving)
-        if finding is not first and not 0 < finding.cost_percent < WORTH_PERCENT
+        if finding is not first and not 0 < finding.cost_percent < LEAST_LOSS_PERCENT
     ]
     others.sort(key=lambda finding: -finding.cost_percent)
     return others if first is None else [replace(first, sentence=first.to_do), *others]

@@ -12,7 +12,7 @@ from deepracer_exp.runs.result import RunResult
 
 from . import off_track
 from .beside import raced_beside
-from .finding import WORTH_PERCENT, WORTH_S, Finding, Numbers, in_order
+from .finding import LEAST_LOSS_PERCENT, LEAST_LOSS_S, Finding, Numbers, in_order
 from .log_view import LEAST_LAPS, LogView, thirds
 from .off_track import JUDGEMENTS, OffTrackPlace, off_track_places
 from .others import costliest
@@ -48,9 +48,10 @@ def _race_with(best: RunResult) -> Finding:
             "No checkpoint was evaluated: `deepracer-exp checkpoints RUN` races the ones that were kept."
         )
         return Finding("submit", sentence, to_do=sentence)
-    which = f"checkpoint {best.iteration:06d}, the best by {best.criterion}: {best.words()}."
     values: Numbers = {"iteration": best.iteration, "by": best.criterion}
-    return Finding("submit", f"The best so far is {which}", values, to_do=f"Race with {which}")
+    sentence = f"The best checkpoint by {best.criterion} is {best.iteration:06d}: {best.words()}."
+    to_do = f"Race with checkpoint {best.iteration:06d}, the best by {best.criterion}: {best.words()}."
+    return Finding("submit", sentence, values, to_do=to_do)
 
 
 def _submit(view: LogView) -> Finding:
@@ -193,7 +194,7 @@ def _time_lost(view: LogView) -> Finding | None:
         return None
     sectors = {part.name: part for part in parts}
     lost = (times.median() - times.min()).sort_values(ascending=False, kind="stable").head(MOST_LOST)
-    lost = lost[lost >= WORTH_S]
+    lost = lost[lost >= LEAST_LOSS_S]
     if not len(lost):
         return None
     best_s, possible_s = float(times.sum(axis=1).min()), float(times.min().sum())
@@ -215,7 +216,7 @@ def _time_lost(view: LogView) -> Finding | None:
     values = {"best_lap_s": best_s, "theoretical_best_s": possible_s}
     values |= {f"lost_s, {name}": float(seconds) for name, seconds in lost.items()}
     cost = 100 * float(lost.sum()) / float(times.sum(axis=1).median())
-    return Finding("time_lost", sentence, values, {"worth_s": WORTH_S}, cost)
+    return Finding("time_lost", sentence, values, {"least_s": LEAST_LOSS_S}, cost)
 
 
 def _costliest(view: LogView) -> Finding | None:
@@ -312,15 +313,20 @@ def _steering(places: Sequence[OffTrackPlace], cost: float) -> Finding:
 
 def _zigzag(view: LogView) -> Finding | None:
     figures, where = zigzag_now(view)
-    if figures is None or figures[0] < ZIGZAG_PER_M or not figures[1] >= ZIGZAG_DEG or figures[2] < WORTH_S:
+    if (
+        figures is None
+        or figures[0] < ZIGZAG_PER_M
+        or not figures[1] >= ZIGZAG_DEG
+        or figures[2] < LEAST_LOSS_S
+    ):
         return None
     cure = CONSOLE_CURE if view.run is None else CURE
     sentence = f"The car zig-zags on straights: {zigzag_in_words(*figures)} lost in the detour ({where}). Try {cure}."
     values = dict(zip(("changes_per_m", "amplitude_deg", "lost_s"), figures, strict=True))
-    thresholds = {"changes_per_m": ZIGZAG_PER_M, "amplitude_deg": ZIGZAG_DEG, "lost_s": WORTH_S}
+    thresholds = {"changes_per_m": ZIGZAG_PER_M, "amplitude_deg": ZIGZAG_DEG, "lost_s": LEAST_LOSS_S}
     lap_s = float(view.now(LEAST_LAPS)[0]["lap_time_s"].median())
     # Without a lap there is nothing to compare with: it is mentioned after all that has a cost in per cent.
-    cost = WORTH_PERCENT if math.isnan(lap_s) else max(WORTH_PERCENT, 100 * figures[2] / lap_s)
+    cost = LEAST_LOSS_PERCENT if math.isnan(lap_s) else max(LEAST_LOSS_PERCENT, 100 * figures[2] / lap_s)
     return Finding("zigzag", sentence, values, thresholds, cost)
 
 

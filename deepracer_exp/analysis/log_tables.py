@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import pandas as pd
 
 from deepracer_exp.errors import count
+from deepracer_exp.runs.result import RunResult
 
 from .against_fastest import loss_in_words
 from .beside import other_tracks, raced_beside
@@ -171,6 +172,43 @@ def trainings(view: LogView) -> str | None:
         return None
     listed = ", ".join(f"{part.name} from iteration {part.first_iteration}" for part in rounds)
     return f"{len(rounds)}, taken as clones one after the other: {listed}"
+
+
+def result_in_words(view: LogView) -> str:
+    """Return in a sentence how well the trained policy races; of a log without evaluations, its `headline`.
+
+    Of a run of ours it is the best checkpoint on the usual and the held-out conditions. Of a log of the service it is
+    the evaluation of the checkpoint to submit, or what its evaluations and races drove.
+    """
+    best = view.candidates
+    if view.run is not None and view.run.best.evaluated:
+        return _result_of_run(view, view.run.best)
+    if len(best) and best["evaluated"].iloc[0]:
+        first = best.iloc[0]
+        laps = f"{first['complete']} of {first['episodes']}"
+        return f"Laps in {first['lap_time_mean_s']:.2f} s, {laps} in its evaluation."
+    races = view.evaluation_episodes
+    laps_s = races["lap_time_s"].dropna()
+    if view.trained and len(laps_s):
+        return f"Laps in {laps_s.mean():.2f} s, {len(laps_s)} of {len(races)} in its evaluations and races."
+    return headline(view)
+
+
+def _result_of_run(view: LogView, best: RunResult) -> str:
+    laps = "" if best.laps_percent is None else f", {best.laps_percent:.0f}% of them complete"
+    tried = None if view.run is None else view.run.evaluations
+    if tried is not None and len(
+        row := tried[tried["iteration"] == best.iteration].dropna(subset="laps_tried")
+    ):
+        laps = f", {row['laps'].iloc[0]:.0f} of {row['laps_tried'].iloc[0]:.0f}"
+    words = (
+        f"No complete lap: {best.completion:.0f}% of the way"
+        if best.lap_time_s is None
+        else f"Laps in {best.lap_time_s:.2f} s{laps}"
+    )
+    if best.held_out_completion is not None:
+        words += f"; on other conditions {best.held_out_completion:.0f}% of the way"
+    return f"{words}."
 
 
 def headline(view: LogView) -> str:

@@ -22,7 +22,7 @@ from deepracer_exp.stopping.judge import (
 from deepracer_exp.stopping.rules import entropy_share
 
 from .charts.runs import run_folder
-from .finding import WORTH_S, Finding, Numbers
+from .finding import LEAST_LOSS_S, Finding, Numbers
 from .log_view import LEAST_EPISODES, LogView
 from .once import once_per_view
 from .rising_entropy import CHANCE as ENTROPY_CHANCE
@@ -270,7 +270,7 @@ def _faster_too(view: LogView) -> str:
         float(laps_s[:3].mean()) if len(laps_s) else 0.0,
         float(laps_s[-3:].mean() if len(laps_s) else 0),
     )
-    if first_s - now_s < WORTH_S:
+    if first_s - now_s < LEAST_LOSS_S:
         return ""
     return (
         f" Its laps became faster meanwhile, from {first_s:.2f} to {now_s:.2f} s: it is faster and less sure."

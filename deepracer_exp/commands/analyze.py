@@ -23,7 +23,6 @@ from .pages import (
 if TYPE_CHECKING:
     from deepracer_exp.analysis.log_view import LogView
     from deepracer_exp.config.car import CarConfig
-    from deepracer_exp.reports.page import Glimpse
 
 _EPILOG = """\
   deepracer-exp analyze RUN                                 one of our runs
@@ -108,13 +107,13 @@ def _analyze(args: argparse.Namespace) -> int:
 
     from deepracer_exp.analysis.beside import other_tracks
     from deepracer_exp.analysis.findings import findings
-    from deepracer_exp.analysis.log_tables import headline, trainings
+    from deepracer_exp.analysis.log_tables import headline, result_in_words, trainings
     from deepracer_exp.analysis.log_view import prepare
     from deepracer_exp.analysis.reward_replay import replay_reward
     from deepracer_exp.analysis.reward_terms import run_terms
     from deepracer_exp.reports.lap_replay import laps_of_log
     from deepracer_exp.reports.log_report import LogPage, write_log_page
-    from deepracer_exp.runs.files import read_config, sees_pictures
+    from deepracer_exp.runs.files import read_config
     from deepracer_exp.runs.recording import is_traced_run, read_log
 
     log = read_log(place)
@@ -125,11 +124,11 @@ def _analyze(args: argparse.Namespace) -> int:
     car = _car(config)
     view, terms = run_terms(prepare(log, args.track), car)
     line = None if args.line is None else recorded_line(view, episode)
-    strip: list[Glimpse] = []
-    if sees_pictures(config):
-        from deepracer_exp.reports.sight import run_glimpses
+    best = None
+    if config:
+        from deepracer_exp.reports.best_drive import drive_best
 
-        view, strip = run_glimpses(view, place)
+        view, best = drive_best(view, place)
     if args.fastest:
         _find_fastest(view, place)
     laps = None if args.replay is None else laps_of_log(view, None)
@@ -138,14 +137,16 @@ def _analyze(args: argparse.Namespace) -> int:
     out = Path(args.output or default)
     sentences = findings(view, target_s)
     with writing(f"--output {out}", "a file in a folder"):
-        write_log_page(out, LogPage(view, sentences, replay, terms, strip))
+        write_log_page(out, LogPage(view, sentences, replay, terms, best))
     if laps is not None:
         write_laps(args.replay, laps)
     if line is not None:
         with writing(f"--line {args.line}"):
             write_line(Path(args.line), line[0])
 
-    print(f"{view.name}: {headline(view)}")
+    print(f"{view.name}: {result_in_words(view)}")
+    if result_in_words(view) != headline(view):
+        print(f"     {headline(view)}")
     several = trainings(view)
     if several is not None:
         print(f"     trainings in it: {several}. One alone: give its files in a folder of their own")

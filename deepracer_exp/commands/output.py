@@ -102,7 +102,7 @@ def print_start() -> None:
 def print_result(outcome: "TrainResult", tracking: "TrackingConfig") -> None:
     """Print how a run ended, where its results are, and what to do next."""
     from deepracer_exp.config.running import MLflowTracking
-    from deepracer_exp.lookup.next_steps import COMMAND, next_steps
+    from deepracer_exp.lookup.next_steps import COMMAND, next_steps, open_report
     from deepracer_exp.runs.result import result_of
 
     summary = outcome.summary
@@ -132,6 +132,8 @@ def print_result(outcome: "TrainResult", tracking: "TrackingConfig") -> None:
     if isinstance(tracking, MLflowTracking) and outcome.unrecorded is None:
         print(f"  compare runs  {_command()} ui{store_word(outcome.folder.parent.parent, tracking.uri)}")
     steps = next_steps(outcome.folder, summary)
+    if (outcome.folder / REPORT).exists():
+        steps.insert(1, open_report(outcome.folder))
     print_steps([(line.replace(COMMAND, _command(), 1), what) for line, what in steps])
     _print_unrecorded([outcome], tracking)
 

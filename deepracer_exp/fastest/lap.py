@@ -42,6 +42,10 @@ COLUMNS = ("time_s", "x_m", "y_m", "yaw_rad", "speed_mps", "progress", "steering
 """Columns of a lap's steps: clock, front point, heading, speed, per cent of the lap, and the command given there."""
 _TRACED = ("tstamp", "X", "Y", "yaw", "speed_mps", "progress", "steer", "throttle")
 _LINE_M = 0.1
+_SHIPPED = Path(__file__).with_name("kept")
+"""Laps as `_keep` writes them: that of the default car on the default track, which a first training is compared with.
+Where a change of the car makes it another question, the file that `deepracer-exp tracks reinvent_base --fastest` leaves
+in the cache takes its place."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -209,8 +213,14 @@ def fastest_lap(question: Question, on_round: OnRound | None = None) -> FastestL
 
 
 def kept_lap(question: Question) -> FastestLap | None:
-    """Return the fastest lap if an earlier search has kept it; a file that holds no lap counts as none."""
-    file = _file(question)
+    """Return the fastest lap if an earlier search has kept it, here or for everyone; else None.
+
+    A file that holds no lap counts as none.
+    """
+    return _read(_file(question)) or _read(_SHIPPED / f"{question.key}.json")
+
+
+def _read(file: Path | None) -> FastestLap | None:
     if file is None or not file.is_file():
         return None
     try:

@@ -16,6 +16,7 @@ from deepracer_exp.runs.files import (
     METRICS,
     RunRecord,
     full_name,
+    is_randomized,
     read_config,
     read_metrics,
     sees_pictures,
@@ -141,7 +142,7 @@ def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
             steps.insert(1, (f"{export} format=car", "write the archive for the car's console"))
     if summary["status"] in (INTERRUPTED, FAILED):
         return [(resume, "continue it from its last checkpoint"), *steps]
-    limit = summary.get("limit")
+    limit, rule = summary.get("limit"), summary.get("rule")
     spent = {
         "env_steps": summary["env_steps"],
         "iterations": summary["iteration"],
@@ -149,6 +150,12 @@ def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     }
     if limit is None:
         resume = command_line("resume", name, config, [group for group in GROUPS if group != "stopping"])
+        if rule == "reliable" and not config["evaluation"].get("real_car"):
+            return [(f"{resume} stopping=entropy", "train longer, until nothing improves any more"), *steps]
+        if rule == "overfitting" and not is_randomized(config):
+            clone, _ = steps.pop()
+            what = "train it further on changing conditions, at a tenth of the learning rate"
+            return [(f"{clone} randomization=sim2real", what), *steps]
         steps.append((f"{resume} stopping=none", "continue it until its budget is used"))
     elif limit in spent:  # else the rest of an experiment's budget decides
         budget = {key: most for key, most in config["budget"].items() if key in spent and most is not None}
@@ -179,6 +186,11 @@ def _rates_that_follow(config: Mapping[str, Any]) -> list[str]:
     if algorithm.get("entropy_end_factor", 1.0) != 1.0 and algorithm.get("entropy_coeff"):
         names.append("entropy bonus")
     return names
+
+
+def open_report(run: Path) -> tuple[str, str]:
+    """Return the command that opens the report of a run, with what it does."""
+    return f"{shlex.join([COMMAND, 'analyze', run_word(run)])} --open", "open its report"
 
 
 def _twice(spent: float) -> str:

@@ -4,10 +4,11 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
+from deepracer_exp.analysis.against_fastest import fastest_in_words
 from deepracer_exp.analysis.charts import (
     actions,
     driving_line,
@@ -27,6 +28,7 @@ from deepracer_exp.analysis.log_tables import (
     headline,
     iteration_rows,
     problem_rows,
+    result_in_words,
 )
 from deepracer_exp.analysis.log_view import LogView
 from deepracer_exp.analysis.reward_replay import ReplayedRewards
@@ -36,14 +38,18 @@ from deepracer_exp.files import atomic_write
 from deepracer_exp.lookup.next_steps import next_steps, official_place, outcome
 from deepracer_exp.runs.files import read_head
 
-from .page import Glimpse, Plot, plot_of, render
+from .page import Plot, plot_of, render
+
+if TYPE_CHECKING:
+    from .best_drive import BestDrive
 
 MOST_FILES = 400
 _BESIDE, _REWARDED = "Generations and tracks", "What the reward function rewards"
+_EVALUATED = "The evaluated lap"
 _OF_FAILURES = ("What is on the road", "Where it goes wrong")
 """Sections on episodes that were no complete lap."""
-_PICTURE = "lap_line"
-"""The figure beside the outcome."""
+_PICTURES = ("evaluated_lap", "lap_line")
+"""The figure beside the outcome: the first of them that there is."""
 SECTIONS: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
     "How it learned": (
         *(training.training_progress, training.learning_vs_lap_time, training.evaluations),
@@ -89,6 +95,7 @@ RACES: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
 FIRST = (
     *(
         "replayed_laps",
+        "evaluated_lap",
         "lap_line",
         "crash_free",
         "crashes_by_object",
@@ -114,8 +121,8 @@ class LogPage:
     """The rewards of another function for the same driving."""
     terms: pd.DataFrame | None = None
     """Contribution of each term of the reward function, as `contributed_terms` returns it."""
-    strip: Sequence[Glimpse] = ()
-    """Pictures that the best policy sees along a lap."""
+    best: "BestDrive | None" = None
+    """What the best policy of a run drives and sees."""
 
 
 def write_log_page(path: Path, page: LogPage) -> Path:
@@ -135,6 +142,9 @@ def draw_sections(page: LogPage) -> dict[str, list[Chart]]:
         drawn["Another reward function"] = [*page.replay.charts]
     sections = SECTIONS if view.trained else RACES
     unknown = _OF_FAILURES if view.laps_only else ()
+    lap = page.best.lap if page.best is not None else driving_line.raced_lap(view)
+    if lap is not None:
+        drawn[_EVALUATED] = [driving_line.evaluated_lap(lap)]
     drawn |= {
         title: [draw_one(view) for draw_one in some] if title not in unknown else []
         for title, some in sections.items()
@@ -152,8 +162,11 @@ def html(page: LogPage) -> str:
     sections = draw_sections(page)
     plots = {chart.name: plot_of(chart) for some in sections.values() for chart in some}
     ranked = sorted(plots, key=lambda name: FIRST.index(name) if name in FIRST else len(FIRST))
+    picture = next((name for name in _PICTURES if name in plots), None)
+    if picture == "evaluated_lap" and "lap_line" in ranked:
+        ranked.append(ranked.pop(ranked.index("lap_line")))
     first = ranked[:MOST_FIRST]
-    shown = {"The most important figures": [name for name in first if name != _PICTURE]}
+    shown = {"The most important figures": [name for name in first if name != picture]}
     for title, some in sections.items():
         shown[title] = [chart.name for chart in some if chart.name not in first]
     files = [readable(str(file)) for file in recording.files]
@@ -164,8 +177,9 @@ def html(page: LogPage) -> str:
         list(plots.values()),
         **_first_screen(page),
         name=view.name,
+        result=result_in_words(view),
         headline=headline(view),
-        picture=plots[_PICTURE] if _PICTURE in first else None,
+        picture=None if picture is None else plots[picture],
         findings=[_finding(finding, plots) for finding in page.findings],
         problem_count=count(len(view.problems), "problem") if view.problems else "",
         replay=page.replay,
@@ -173,7 +187,7 @@ def html(page: LogPage) -> str:
         trained=view.trained,
         evaluated=bool(view.candidates["evaluated"].any()),
         laps=best_laps(view),
-        strip=page.strip,
+        strip=() if page.best is None else page.best.strip,
         sections=[(title, [plots[name] for name in names]) for title, names in shown.items() if names],
         captions={chart.name: chart.caption for some in sections.values() for chart in some},
         iterations=iteration_rows(view),
@@ -193,7 +207,7 @@ def _first_screen(page: LogPage) -> dict[str, Any]:
     Steps are commands, each with what it does.
 
     The title is the experiment's name, of a log that of its file. Our commands do not take checkpoints of the service:
-    the next step with those is to submit one of them.
+    the next step with a training of those is what its first finding says.
     """
     folder = run_folder(page.view)
     try:
@@ -203,17 +217,18 @@ def _first_screen(page: LogPage) -> dict[str, Any]:
             return {
                 "title": str(run.config.get("name") or page.view.name),
                 "outcome": outcome(run),
+                "fastest": fastest_in_words(page.view, folder),
                 "official_place": official_place(run),
                 "steps": steps,
             }
     except BadInput:
         pass  # the page lists which files could not be read
-    submit = [("", finding.sentence) for finding in page.findings if finding.rule == "submit"]
     return {
         "title": page.view.name,
         "outcome": facts(page.view),
+        "fastest": None,
         "official_place": None,
-        "steps": submit,
+        "steps": [("", finding.sentence) for finding in page.findings[: int(page.view.trained)]],
     }
 
 

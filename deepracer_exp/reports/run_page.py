@@ -14,7 +14,7 @@ from deepracer_exp.config.race import RaceConfig
 from deepracer_exp.env.placement import box_corners_of, read_placements
 from deepracer_exp.env.setup import Course
 from deepracer_exp.lookup.next_steps import COMMAND, own_word
-from deepracer_exp.runs.files import BEST_LAP, LEARNING, METRICS, REPORT, TRACE, read_config, sees_pictures
+from deepracer_exp.runs.files import BEST_LAP, LEARNING, METRICS, REPORT, TRACE, read_config
 from deepracer_exp.runs.trace import has_trace, missing_trace, read_others, read_trace
 from deepracer_exp.tracks.track import Track
 
@@ -66,16 +66,12 @@ def write_run_page(run_dir: Path, car: CarConfig) -> str | None:
         from deepracer_exp.analysis.reward_terms import run_terms
         from deepracer_exp.runs.recording import read_run_recording
 
+        from .best_drive import drive_best
         from .log_report import LogPage, write_log_page
-        from .page import Glimpse
 
         view, terms = run_terms(prepare(read_run_recording(run_dir)), car, just_trained=True)
-        strip: list[Glimpse] = []
-        if sees_pictures(read_config(run_dir)):
-            from .sight import run_glimpses
-
-            view, strip = run_glimpses(view, run_dir, just_trained=True)
-        write_log_page(run_dir / REPORT, LogPage(view, findings(view), terms=terms, strip=strip))
+        view, best = drive_best(view, run_dir, just_trained=True)
+        write_log_page(run_dir / REPORT, LogPage(view, findings(view), terms=terms, best=best))
     except KeyboardInterrupt:
         return f"{REPORT} was left off; `{COMMAND} analyze {shlex.quote(own_word(run_dir))}` writes it"
     except Exception as error:

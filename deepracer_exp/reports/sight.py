@@ -1,8 +1,6 @@
 """What a policy sees, and where it looks: pictures of its camera, with the places that its decision depends on."""
 
-from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import matplotlib
 import numpy as np
@@ -14,17 +12,10 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from deepracer_exp.analysis.log_view import LogView
-from deepracer_exp.aws.logs.recording import LogProblem
 from deepracer_exp.config.driving import CameraConfig
-from deepracer_exp.config.own_class import OF_POLICY, named_again
 from deepracer_exp.env.action_space import ActionSpace
-from deepracer_exp.errors import BadInput, RunFailed
-from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.evaluation.film import Lap, drive_best_lap, png
-from deepracer_exp.lookup.resolve import StoredRun
+from deepracer_exp.evaluation.film import Lap, png
 from deepracer_exp.reports.page import Glimpse, png_uri
-from deepracer_exp.runs.files import read_config
 
 SPACING, SPREAD = 12, 18
 """Blurred places along the picture's width, and the width in standard deviations of one of them."""
@@ -136,29 +127,3 @@ def glimpses(
             )
         )
     return strip
-
-
-def run_glimpses(view: LogView, folder: Path, just_trained: bool = False) -> tuple[LogView, list[Glimpse]]:
-    """Return a recorded training's view and what its best policy sees along a lap, driven again for this.
-
-    Args:
-        view: the training.
-        folder: of the run, whose policy sees pictures.
-        just_trained: the training in this process has imported the user's own classes; else a run that needs them is
-            left out, since a recording may come from anywhere.
-
-    Returns:
-        The view, with another problem if the policy could not be used; what it sees.
-    """
-    if not just_trained and named_again(read_config(folder), OF_POLICY):
-        return view, []
-    try:
-        run = StoredRun(folder).with_checkpoint()
-        experiment = run.experiment
-        assert experiment.observation.camera is not None
-        policy = run.read_policy().networks.policy
-        evaluator = Evaluator(experiment, replace(experiment.evaluation, trials=1, laps=1, held_out=None))
-        lap, acted = drive_best_lap(evaluator, policy)
-    except (BadInput, RunFailed) as error:
-        return replace(view, problems=(*view.problems, LogProblem(view.name, None, str(error)))), []
-    return view, glimpses(lap, acted, policy, evaluator.race.setup.actions, experiment.observation.camera)

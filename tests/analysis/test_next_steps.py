@@ -49,6 +49,24 @@ def test_a_policy_for_the_car_is_raced_as_the_car_and_exported(runs):
     assert [line.split()[1] for line in others] == [line.split()[1] for line in plain[1:]]
 
 
+def test_what_ended_a_run_decides_which_step_is_the_first(runs):
+    run = runs[1]
+    summary = {**read_object(run / "summary.json"), "limit": None}
+    lines = {
+        rule: next_steps(run, {**summary, "rule": rule}) for rule in ("reliable", "overfitting", "converged")
+    }
+    first = {rule: some[0][0] for rule, some in lines.items()}
+    assert first["reliable"] == f"deepracer-exp resume {own_word(run)} stopping=entropy"
+    assert first["overfitting"] == f"deepracer-exp clone {run_word(run)} randomization=sim2real"
+    assert first["converged"] == f"deepracer-exp evaluate {run_word(run)}"
+    assert [line.split()[1] for line, _ in lines["overfitting"]].count("clone") == 1
+    # What is trained on changing conditions already is not advised to be.
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    config["randomization"]["friction_scale"] = [0.8, 1.2]
+    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    assert next_steps(run, {**summary, "rule": "overfitting"})[0][0] == first["converged"]
+
+
 @pytest.mark.parametrize(
     ("lr_schedule", "algorithm", "held"),
     [

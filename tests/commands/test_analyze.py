@@ -40,6 +40,13 @@ def test_a_run_is_analysed_into_its_folder_and_the_terminal_reports_what_stands_
     page = (run_dir / "report.html").read_text()
     assert 'id="figure-reward_terms"' in page
     assert "<h1>tiny</h1>" in page
+    # The result of the evaluation and the lap that it drove stand before all that exploration did.
+    shown = [
+        text.index(words) for words in ("on other conditions", "The fastest lap found of this car", "16,384")
+    ]
+    assert shown == sorted(shown)
+    first, *_ = re.findall(r'id="figure-(\w+)"', page)
+    assert first == "evaluated_lap"
     assert f"<title>tiny: {run_dir.name}</title>" in page
 
 
@@ -155,6 +162,7 @@ def test_a_training_ends_with_its_page_which_stands_in_its_mlflow_run_too(call):
     ended = call("train", *tiny, "report=true", pictures=True)
     assert ended.code == 0, ended.stderr
     assert "report.html" in ended.stdout
+    assert re.search(r"deepracer-exp analyze \S+ --open +# open its report", ended.stdout)
     assert "1,024 control steps" in findings_told(ended.folder / "report.html")
     client = MlflowClient(tracking_uri=f"sqlite:///{ended.cwd / 'runs' / 'mlflow.db'}")
     found = {file.path for file in client.list_artifacts(read_run_id(ended.folder) or "")}

@@ -79,6 +79,16 @@ def test_a_corrupt_file_counts_as_none(lap, cache, text):
     assert json.loads(content)["columns"] == list(fastest.COLUMNS)
 
 
+def test_the_lap_of_the_default_car_on_the_default_track_needs_no_search(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    experiment = compose_experiment([])[0]
+    (config,) = experiment.tracks.values()
+    kept = kept_lap(Question.of(experiment, Track.from_config(config, reversed=False)))
+    assert kept is not None
+    assert kept.bound_s <= kept.lap_time_s == pytest.approx(float(lap_clock_s(len(kept.steps), 1 / 15)))
+    assert kept.column("progress")[-1] == 100.0
+
+
 def test_the_lap_depends_on_track_car_and_limits():
     others = (
         question("car=deepracer_v5"),

@@ -1,14 +1,22 @@
 import dataclasses
 import re
-from html import unescape
+from html import escape, unescape
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from deepracer_exp.analysis.findings import FIGURES, findings
-from deepracer_exp.analysis.log_tables import MOST_ITERATIONS, facts, headline, iteration_rows
+from deepracer_exp.analysis.charts.driving_line import raced_lap
+from deepracer_exp.analysis.finding import FIGURES
+from deepracer_exp.analysis.findings import findings
+from deepracer_exp.analysis.log_tables import (
+    MOST_ITERATIONS,
+    facts,
+    headline,
+    iteration_rows,
+    result_in_words,
+)
 from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.reward_replay import ReplayedRewards
 from deepracer_exp.aws.logs.recording import LogProblem, Recording
@@ -72,6 +80,24 @@ def test_the_page_begins_with_outcome_and_findings_and_each_leads_to_a_figure_th
     assert order[-1] < read.text.rindex("Candidates for submission")
     assert set(read.links) <= set(read.ids)
     assert {f"figure-{one.figure}" for one in found} <= set(read.ids)
+
+
+def test_the_first_screen_is_what_was_raced_and_exploration_comes_below(html, view):
+    read = Html(html)
+    result = result_in_words(view)
+    times_s = view.evaluation_episodes["lap_time_s"]
+    assert result == f"Laps in {times_s.mean():.2f} s, 3 of 3 in its evaluations and races."
+    assert read.text.index(result) < read.text.index("What was found") < read.text.index(headline(view))
+    assert next(name for name in read.ids if name.startswith("figure")) == "figure-evaluated_lap"
+    lap = raced_lap(view)
+    assert lap.words.startswith(f"The fastest evaluated lap: {times_s.min():.2f} s, race")
+    assert len(lap.x_m) == pytest.approx(15 * times_s.min(), abs=2)
+    # A race without a training has its own laps as laps.
+    assert raced_lap(prepare(made_up_recording([], evaluations={"race": [Drive()]}))) is None
+
+
+def test_a_log_of_the_service_is_advised_by_its_first_finding(view, html):
+    assert f"<p>{escape(findings(view)[0].sentence)}</p>" in " ".join(html.split())
 
 
 def test_the_page_is_small_loads_nothing_and_has_words_and_tables_without_scripts(path, html, view):

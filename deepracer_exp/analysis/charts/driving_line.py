@@ -1,5 +1,7 @@
 """The line that the car drives: sectors, speed, steering, slide and zig-zag, and what it loses to the fastest lap."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pandas as pd
 
@@ -9,9 +11,10 @@ from deepracer_exp.analysis.log_view import STARTING_STEPS, LogView, closest_way
 from deepracer_exp.analysis.racing_line import center_line, minimum_curvature_line
 from deepracer_exp.analysis.sectors import sectors_now, sectors_of
 from deepracer_exp.analysis.statistics import MOST_ROWS, Values, means, quantiles, subsample
-from deepracer_exp.analysis.step_columns import SPEED_STEPS
+from deepracer_exp.analysis.step_columns import SPEED_STEPS, first_rows
 from deepracer_exp.analysis.zigzag import CENTRED_DEG, zigzag_in_words, zigzag_now
 from deepracer_exp.errors import count
+from deepracer_exp.tracks.track import Track
 
 from .figure import Chart, Layer, Panel, band, bars, color_range, colored_points, line, note, points
 from .maps import LEAST_STEPS, Grid, beside, map_panel, outlines, waypoint_panel
@@ -63,6 +66,64 @@ def lap_line(view: LogView) -> Chart | None:
         + " The outlines are the boxes of this episode."
         * bool(around),
         rows=[[map_panel(view.course, [line(lap["X"], lap["Y"], PALE, width=1.25), *around, dots])]],
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EvaluatedLap:
+    """A lap of a policy that takes its most probable actions; arrays (n,)."""
+
+    words: str
+    """Description of the lap, the title of its picture."""
+    course: Track
+    x_m: Values
+    y_m: Values
+    speed_mps: Values
+    boxes: Values
+    """Corners of the boxes on the road, (k, 4, 2)."""
+
+
+def raced_lap(view: LogView) -> EvaluatedLap | None:
+    """Return the fastest lap of the evaluations and races beside a training; None without one."""
+    laps_s = view.evaluation_episodes["lap_time_s"]
+    if not view.trained or view.course is None or not laps_s.notna().any():
+        return None
+    number = int(np.nanargmin(laps_s.to_numpy(np.float64)))
+    steps = view.evaluation_steps
+    lap = steps[(np.cumsum(first_rows(steps)) - 1 == number) & steps["track_speed_mps"].notna()]
+    return EvaluatedLap(
+        words=f"The fastest evaluated lap: {laps_s.iloc[number]:.2f} s, "
+        f"{view.evaluation_episodes['stream'].iloc[number]}",
+        course=view.course,
+        x_m=lap["X"].to_numpy(np.float64),
+        y_m=lap["Y"].to_numpy(np.float64),
+        speed_mps=lap["track_speed_mps"].to_numpy(np.float64),
+        boxes=np.zeros((0, 4, 2)),
+    )
+
+
+def evaluated_lap(lap: EvaluatedLap) -> Chart:
+    """Draw an evaluated lap on the course, coloured by speed."""
+    hover = [f"driven {speed:.2f} m/s" for speed in lap.speed_mps]
+    # The few steps after a standing start would take half of the colours.
+    low, high = float(np.percentile(lap.speed_mps, 10)), float(lap.speed_mps.max())
+    dots = colored_points(
+        lap.x_m,
+        lap.y_m,
+        lap.speed_mps,
+        "speed, m/s",
+        size=7.5,
+        hover=hover,
+        value_range=(low, max(high, low + 0.1)),
+    )
+    around = [outlines(lap.boxes, VERMILION, width=2.0)] if len(lap.boxes) else []
+    layers = [line(lap.x_m, lap.y_m, PALE, width=1.25), *around, dots]
+    return Chart(
+        name="evaluated_lap",
+        title=lap.words,
+        caption="One dot for each control step, coloured by the speed of the car. In an evaluation the policy takes "
+        "its most probable actions; while it trains it explores, and drives otherwise.",
+        rows=[[map_panel(lap.course, layers, numbers=False)]],
     )
 
 
