@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 LEAST_LOSS_S = 0.05
 """Seconds a lap below which a loss is not mentioned."""
 LEAST_LOSS_PERCENT = 1.0
-"""The same in per cent, of completion, of laps that fail, or of the lap time."""
+"""Loss below which it is not mentioned, in per cent of completion, of laps that fail, or of the lap time."""
 FIGURES = {
     "converged": "training_progress",
     "submit": "lap_time_percentile",

@@ -29,7 +29,7 @@ class RisingEntropy:
     lowest: float
     now: float
     rise: float
-    """See `RISE`."""
+    """How much it rose, as `RISE` counts."""
 
 
 def rising_entropy(iterations: pd.DataFrame, action_count: int | None) -> RisingEntropy | None:
@@ -46,11 +46,11 @@ def rising_entropy(iterations: pd.DataFrame, action_count: int | None) -> Rising
     if len(rows) < LEAST_ITERATIONS:
         return None
     entropy = moving_average(rows["entropy"].to_numpy(np.float64))
-    at = int(entropy.argmin())
-    lowest, now = float(entropy[at]), float(entropy[-1])
+    place = int(entropy.argmin())
+    lowest, now = float(entropy[place]), float(entropy[-1])
     rise = entropy_share(now, lowest, action_count) - entropy_share(lowest, lowest, action_count)
     parts = np.array_split(rows["entropy"].to_numpy(np.float64), _BLOCKS)
     blocks = np.array([part.mean() for part in parts])
     if rise < RISE or not chance_of_rise(blocks[blocks.argmin() :]) < CHANCE / _BLOCKS:
         return None
-    return RisingEntropy(since=int(rows["iteration"].iloc[at]), lowest=lowest, now=now, rise=rise)
+    return RisingEntropy(since=int(rows["iteration"].iloc[place]), lowest=lowest, now=now, rise=rise)

@@ -39,8 +39,8 @@ _ENTROPY_COST_PERCENT = 5.0
 
 def training_findings(view: LogView, submit: Finding) -> list[Finding]:
     """Return the findings on a training, of equally costly ones the more urgent first; `submit` is one of them."""
-    found = [_entropy_rises(view), _laps_slower(view), _overfits(view), _progress(view), submit]
-    return [finding for finding in found if finding is not None]
+    of_training = [_entropy_rises(view), _laps_slower(view), _overfits(view), _progress(view), submit]
+    return [finding for finding in of_training if finding is not None]
 
 
 def _progress(view: LogView) -> Finding:

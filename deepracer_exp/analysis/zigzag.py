@@ -39,7 +39,7 @@ CURE = (
 )
 
 CONSOLE_CURE = "smaller steering angles in the action space"
-"""The same for a training of the service."""
+"""What helps a training of the service, in the words of its console."""
 
 Figures = tuple[float, float, float]
 """`changes_per_m`, `amplitude_deg` (NaN without a change) and `lost_s` of a `ZigZag`."""

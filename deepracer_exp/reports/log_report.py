@@ -204,11 +204,10 @@ def html(page: LogPage) -> str:
 def _first_screen(page: LogPage) -> dict[str, Any]:
     """Return the title, the result in names and values, the place on the official board, and the next steps.
 
-    Steps are commands, each with what it does.
-
-    The title is the experiment's name, of a log that of its file. Our commands do not take checkpoints of the service:
-    the next step with a training of those is what its first finding says.
+    The title is the experiment's name, of a log that of its file. What to do next with a training is what its first
+    finding says; with a run of ours, commands follow, each with what it does. They take no checkpoints of the service.
     """
+    to_do = [("", finding.sentence) for finding in page.findings[: int(page.view.trained)]]
     folder = run_folder(page.view)
     try:
         run = read_head(folder) if folder is not None else None
@@ -217,9 +216,9 @@ def _first_screen(page: LogPage) -> dict[str, Any]:
             return {
                 "title": str(run.config.get("name") or page.view.name),
                 "outcome": outcome(run),
-                "fastest": fastest_in_words(page.view, folder),
+                "fastest": fastest_in_words(page.view, run.path),
                 "official_place": official_place(run),
-                "steps": steps,
+                "steps": [*to_do, *steps],
             }
     except BadInput:
         pass  # the page lists which files could not be read
@@ -228,7 +227,7 @@ def _first_screen(page: LogPage) -> dict[str, Any]:
         "outcome": facts(page.view),
         "fastest": None,
         "official_place": None,
-        "steps": [("", finding.sentence) for finding in page.findings[: int(page.view.trained)]],
+        "steps": to_do,
     }
 
 
