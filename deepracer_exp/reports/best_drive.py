@@ -72,12 +72,13 @@ def _shown(lap: Lap, checkpoint: str) -> EvaluatedLap:
     """Return a lap of a checkpoint for its picture; in the prepare step the car stands."""
     attempt = lap.attempt
     words = (
-        f"The fastest evaluated lap: {attempt.time_s:.2f} s, checkpoint {checkpoint}"
+        f"The fastest evaluated lap: {attempt.time_s:.2f} s"
         if attempt.complete
-        else f"Evaluated, checkpoint {checkpoint} comes {attempt.progress:.0f}% of the way"
+        else f"Evaluated, it comes {attempt.progress:.0f}% of the way"
     )
     return EvaluatedLap(
         words=words,
+        whose=f"checkpoint {checkpoint}",
         course=lap.track,
         x_m=lap.x_m[1:],
         y_m=lap.y_m[1:],

@@ -75,6 +75,8 @@ class EvaluatedLap:
 
     words: str
     """Description of the lap, the title of its picture."""
+    whose: str
+    """Checkpoint, or the evaluation or race of a log."""
     course: Track
     x_m: Values
     y_m: Values
@@ -92,8 +94,8 @@ def raced_lap(view: LogView) -> EvaluatedLap | None:
     steps = view.evaluation_steps
     lap = steps[(np.cumsum(first_rows(steps)) - 1 == number) & steps["track_speed_mps"].notna()]
     return EvaluatedLap(
-        words=f"The fastest evaluated lap: {laps_s.iloc[number]:.2f} s, "
-        f"{view.evaluation_episodes['stream'].iloc[number]}",
+        words=f"The fastest evaluated lap: {laps_s.iloc[number]:.2f} s",
+        whose=str(view.evaluation_episodes["stream"].iloc[number]),
         course=view.course,
         x_m=lap["X"].to_numpy(np.float64),
         y_m=lap["Y"].to_numpy(np.float64),
@@ -121,8 +123,8 @@ def evaluated_lap(lap: EvaluatedLap) -> Chart:
     return Chart(
         name="evaluated_lap",
         title=lap.words,
-        caption="One dot for each control step, coloured by the speed of the car. In an evaluation the policy takes "
-        "its most probable actions; while it trains it explores, and drives otherwise.",
+        caption=f"A lap of {lap.whose}. One dot for each control step, coloured by the speed of the car. In an "
+        "evaluation the policy takes its most probable actions; while it trains it explores, and drives otherwise.",
         rows=[[map_panel(lap.course, layers, numbers=False)]],
     )
 
