@@ -10,7 +10,7 @@ from deepracer_exp.runs.files import CONFIG, TRACE, is_run
 
 from .arguments import STORES, Stores, add_command, add_run, read_stores, runs_and_overrides
 from .compare_runs import compare_runs
-from .output import check_file, print_table, table_console, warnings_on_stderr
+from .output import check_file, plain_console, print_table, table_console, warnings_on_stderr
 from .pages import (
     Item,
     add_page,
@@ -191,10 +191,8 @@ def _against_log(args: argparse.Namespace, item: Item, place: Path, checkpoint: 
 
     from deepracer_exp.reports.driven_against_log import race_against_log
 
-    from .terminal import Terminal
-
     with warnings_on_stderr():
-        both = race_against_log(run, view, args.track, Terminal(stderr=True, highlight=False))
+        both = race_against_log(run, view, args.track, plain_console(stderr=True))
     learned = None
     if (run.path / TRACE).is_dir() and (args.replay is not None or prepare(recording, args.track).trained):
         views = [prepare(read_log(run.path)), prepare(recording, args.track)]

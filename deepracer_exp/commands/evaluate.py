@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from deepracer_exp.errors import BadInput
 
 from .arguments import add_command, add_run, port, run_and_overrides, runs_and_overrides, split_stores
-from .output import check_file, table_console, warnings_on_stderr
+from .output import check_file, plain_console, table_console, warnings_on_stderr
 from .pages import add_replay, drive_given, page_name, read_drive, write_laps
 
 if TYPE_CHECKING:
@@ -153,11 +153,9 @@ def _evaluate(args: argparse.Namespace) -> int:
 
     from deepracer_exp.evaluation.evaluate import evaluate_run
 
-    from .terminal import Terminal
-
-    out = Terminal(width=None if sys.stdout.isatty() else 160)
+    out = table_console(160)
     with warnings_on_stderr():
-        evaluate_run(plan, video, out, Terminal(stderr=True), trace)
+        evaluate_run(plan, video, out, plain_console(stderr=True), trace)
     return 0
 
 
@@ -183,11 +181,9 @@ def _check(args: argparse.Namespace) -> int:
 
     from deepracer_exp.export.car_check import check_run
 
-    from .terminal import Terminal
-
     with warnings_on_stderr():
         picture = None if args.output is None else Path(args.output)
-        check_run(plan, picture, table_console(160), Terminal(stderr=True))
+        check_run(plan, picture, table_console(160), plain_console(stderr=True))
     return 0
 
 
@@ -243,11 +239,17 @@ def _watch(args: argparse.Namespace) -> int:
 
         from deepracer_exp.reports.watch import film_run
 
-        from .terminal import Terminal
 
         file = None if args.output is None else Path(args.output)
         with warnings_on_stderr():
-            film_run(plan.run, plan.config.evaluation, file, Terminal(), Terminal(stderr=True), plan.rival)
+            film_run(
+                plan.run,
+                plan.config.evaluation,
+                file,
+                plain_console(),
+                plain_console(stderr=True),
+                plan.rival,
+            )
         return 0
     from deepracer_exp.reports.live_server import LiveServer
 
@@ -275,10 +277,8 @@ def _film_drive(args: argparse.Namespace, place: Path, run: str | None, override
 
     from deepracer_exp.reports.car_film import film_drive
 
-    from .terminal import Terminal
-
     file = Path(args.output or page_name("drive", log.name).with_suffix(".mp4"))
-    film_drive(file, log, policy, Terminal(stderr=True))
+    film_drive(file, log, policy, plain_console(stderr=True))
     print(f"  film  {file}")
     return 0
 
@@ -368,9 +368,7 @@ def _checkpoints(args: argparse.Namespace) -> int:
 
     from deepracer_exp.reports.checkpoint_comparison import show_checkpoints
 
-    from .terminal import Terminal
-
-    progress = Terminal(stderr=True, highlight=False, markup=False)
+    progress = plain_console(stderr=True)
     with warnings_on_stderr():
         show_checkpoints(
             plan.run, plan.config.evaluation, args.output, table_console(160), progress, plan.rival

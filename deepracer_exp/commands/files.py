@@ -11,7 +11,7 @@ from deepracer_exp.collectors.forking import start_workers_early
 from deepracer_exp.errors import BadInput
 
 from .arguments import add_command, add_overrides, add_run, read_stores, run_and_overrides
-from .output import print_notes, warnings_on_stderr
+from .output import plain_console, print_notes, warnings_on_stderr
 
 
 def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -180,10 +180,8 @@ def _export(args: argparse.Namespace) -> int:
 
     from deepracer_exp.export.export import export
 
-    from .terminal import Terminal
-
     with warnings_on_stderr():
-        export(run, **chosen, output=args.output, out=Terminal(highlight=False, markup=False))
+        export(run, **chosen, output=args.output, out=plain_console())
     return 0
 
 
@@ -219,9 +217,7 @@ def _validate(args: argparse.Namespace) -> int:
 
     from deepracer_exp.validation.validate import validate_reward
 
-    from .terminal import Terminal
-
-    return validate_reward(plan, trial, args.output, args.strict, Terminal(), Terminal(stderr=True))
+    return validate_reward(plan, trial, args.output, args.strict, plain_console(), plain_console(stderr=True))
 
 
 def _trial_overrides(word: str) -> list[str]:

@@ -47,11 +47,20 @@ def check_file(flag: str, file: str | None, ending: str = "") -> None:
     raise BadInput(f"{flag} {file}", "" if ending else "its folder does not exist", _WRITTEN[ending])
 
 
-def table_console(piped_width: int = 200) -> "Console":
-    """Return a console for tables on standard output; a pipe has no width of its own."""
+def plain_console(**options: Any) -> "Console":
+    """Return a console that prints texts as they are: brackets are no markup, `:car:` is no emoji.
+
+    All consoles come from here. Past its console, Rich reads markup in the title of a panel, in a status and beside a
+    progress bar: what stands there, names of studies and checkpoints, can have no brackets.
+    """
     from .terminal import Terminal
 
-    return Terminal(width=None if sys.stdout.isatty() else piped_width, highlight=False, markup=False)
+    return Terminal(markup=False, emoji=False, highlight=False, **options)
+
+
+def table_console(piped_width: int = 200) -> "Console":
+    """Return a console for tables on standard output; a pipe has no width of its own."""
+    return plain_console(width=None if sys.stdout.isatty() else piped_width)
 
 
 def print_table(console: "Console", title: str | None, table: "Table") -> None:

@@ -10,7 +10,7 @@ from deepracer_exp.errors import BadInput, writing
 from .arguments import add_command, add_overrides, is_override
 from .evaluate import choose_graphics
 from .files import picture_file
-from .output import check_file, print_notes, table_console
+from .output import check_file, plain_console, print_notes, table_console
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -188,14 +188,12 @@ def search_fastest(experiment: "Experiment", track: "Track") -> "FastestLap":
 
     from deepracer_exp.fastest.lap import Question, fastest_lap, kept_lap
 
-    from .terminal import Terminal
-
     question = Question.of(experiment, track)
     kept = kept_lap(question)
     if kept is not None:
         return kept
     columns = (*Progress.get_default_columns()[:3], TimeRemainingColumn())
-    with Progress(*columns, console=Terminal(stderr=True), transient=True) as progress:
+    with Progress(*columns, console=plain_console(stderr=True), transient=True) as progress:
         task = progress.add_task("fastest lap", total=1.0)
 
         def show(share: float, lap_time_s: float | None) -> None:
@@ -231,8 +229,6 @@ def _film(lap: "FastestLap", track: "Track", experiment: "Experiment", args: arg
     from deepracer_exp.evaluation.race_protocol import Attempt
     from deepracer_exp.evaluation.video import write_video
 
-    from .terminal import Terminal
-
     attempt = Attempt(
         trial=0,
         begin_s=0.0,
@@ -254,7 +250,7 @@ def _film(lap: "FastestLap", track: "Track", experiment: "Experiment", args: arg
         speed_mps=lap.column("speed_mps"),
         progress=lap.column("progress"),
     )
-    write_video(Path(args.video), film_lap, experiment.car, Terminal(stderr=True))
+    write_video(Path(args.video), film_lap, experiment.car, plain_console(stderr=True))
     print(f"\nfilm: {args.video}")
 
 

@@ -20,6 +20,7 @@ from .arguments import (
     split_stores,
 )
 from .output import (
+    plain_console,
     print_notes,
     print_result,
     print_results,
@@ -143,14 +144,12 @@ def _train(args: argparse.Namespace) -> int:
 
     from deepracer_exp.training.run import run_training, try_out
 
-    from .terminal import Terminal
-
     if len(plans) > 1:
         for plan in plans:
             try_out(plan)
     outcomes = []
     for plan in plans:
-        outcome = run_training(plan, Terminal(stderr=True))
+        outcome = run_training(plan, plain_console(stderr=True))
         outcomes.append(outcome)
         if plan.experiment.debug and outcome.error is not None:
             traceback.print_exception(outcome.error)
@@ -195,10 +194,8 @@ def _continue(plan: "ResumePlan | TrainPlan") -> int:
 
     from deepracer_exp.training.run import run_training
 
-    from .terminal import Terminal
-
     with warnings_on_stderr():
-        outcome = run_training(plan, Terminal(stderr=True))
+        outcome = run_training(plan, plain_console(stderr=True))
     print_result(outcome, plan.experiment.tracking)
     return outcome.exit_code
 
@@ -285,10 +282,8 @@ def _sweep(args: argparse.Namespace) -> int:
     from deepracer_exp.sweeps.report.best import complete_trials
     from deepracer_exp.sweeps.sweep import sweep
 
-    from .terminal import Terminal
-
     with warnings_on_stderr():
-        study, folder, code = sweep(plan, Terminal(stderr=True))
+        study, folder, code = sweep(plan, plain_console(stderr=True))
     if code:
         where = [word for word in args.overrides if word.startswith(("runs_dir=", "sweep.storage="))]
         line = shlex.join(["deepracer-exp", "sweep", f"study={study.study_name}", *where])

@@ -193,7 +193,6 @@ def evaluate_run(
         f"{run.path.name}, checkpoint {stored.path.name}: {count(len(evaluator.trials), 'trial')}"
         + _against(plan, rival, evaluator),
         soft_wrap=True,
-        highlight=False,
     )
     evaluation = evaluator(
         stored.networks.policy,
@@ -212,24 +211,22 @@ def evaluate_run(
         out.print()
         out.print(car_table(car))
         for line in explain_controls(run.experiment, config):
-            out.print(f"  {line}", soft_wrap=True, highlight=False)
+            out.print(f"  {line}", soft_wrap=True)
     for track, on_track in places.items():
         laps = next(group for group in evaluation.groups if group.track == track and group.condition == USUAL)
         part = f"; {len(laps.lap_times_s)} of {len(laps.decided)} laps were complete" * (laps.lap_share < 1)
-        out.print(f"\n{on_track[0].words}{part}", soft_wrap=not out.is_terminal, highlight=False)
-    out.print(
-        f"\n  zig-zag  {evaluation.on(USUAL).zigzag.words()}, on straights", soft_wrap=True, highlight=False
-    )
-    out.print(f"  results  {file}", soft_wrap=True, highlight=False)
+        out.print(f"\n{on_track[0].words}{part}", soft_wrap=not out.is_terminal)
+    out.print(f"\n  zig-zag  {evaluation.on(USUAL).zigzag.words()}, on straights", soft_wrap=True)
+    out.print(f"  results  {file}", soft_wrap=True)
     if trace is not None:
         for written in traced.write(trace, evaluator.race):
-            out.print(f"  trace    {written}", soft_wrap=True, highlight=False)
+            out.print(f"  trace    {written}", soft_wrap=True)
     files = {file: EVALUATIONS}
     if video is not None:
         from .video import write_video  # imports MuJoCo's renderer
 
         write_video(video, recorder.lap(best_attempt(evaluation)), evaluator.race.setup.car, err)
-        out.print(f"  video    {video}", soft_wrap=True, highlight=False)
+        out.print(f"  video    {video}", soft_wrap=True)
         files[video] = FILMS
     tracking = run.experiment.tracking
     uri = plan.config.tracking.uri or (tracking.uri if isinstance(tracking, MLflowTracking) else None)

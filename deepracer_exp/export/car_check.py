@@ -159,10 +159,10 @@ def check_run(plan: EvaluatePlan, picture: Path | None, out: Console, err: Conso
     archive = car_archive(stored.networks, experiment)
     torch.set_num_threads(1)
     policy = stored.networks.policy
-    err.print(f"{run.path.name}, checkpoint {stored.path.name}", soft_wrap=True, highlight=False)
+    err.print(f"{run.path.name}, checkpoint {stored.path.name}", soft_wrap=True)
     laps = {}
     for name, protocol in {**car_protocols(config), CAR: config}.items():
-        err.print(f"  driving {_NAMES.get(name, f'with the {name} of the car')}", highlight=False)
+        err.print(f"  driving {_NAMES.get(name, f'with the {name} of the car')}")
         evaluator = Evaluator(experiment, protocol)
         edges = _Edges(evaluator)
         laps[name] = CarLaps(evaluator(policy, edges), edges.near_m())
@@ -192,14 +192,14 @@ def check_run(plan: EvaluatePlan, picture: Path | None, out: Console, err: Conso
     print_check(check, archive, experiment, config, out)
     out.print()
     for name, file in files.items():
-        out.print(f"  {name:8}  {file}", soft_wrap=True, highlight=False)
+        out.print(f"  {name:8}  {file}", soft_wrap=True)
     out.print()
     steps = check.to_do()
     if not steps:
         out.print("ready", style="bold")
     for step in steps:
         # In a pipe, a line for each.
-        out.print(f"not ready: {step}", soft_wrap=not out.is_terminal, highlight=False)
+        out.print(f"not ready: {step}", soft_wrap=not out.is_terminal)
     return check
 
 

@@ -114,7 +114,7 @@ class LivePage:
             words=f"checkpoint {stored.path.name}, {stored.counters['env_steps']:,} steps",
             plot=plot_of(chart),
             caption=chart.caption,
-            table=results_table(evaluation, self._protocol, trained, Console(width=200)),
+            table=results_table(evaluation, self._protocol, trained, Console(quiet=True, width=200)),
             strip=strip,
         )
 

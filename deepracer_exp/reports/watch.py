@@ -296,7 +296,6 @@ def film_run(
     evaluator = evaluator_against(rival, run.experiment, replace(protocol, held_out=None))
     err.print(
         f"{run.path.name}, checkpoint {stored.path.name}: {count(len(evaluator.trials), 'trial')}",
-        highlight=False,
     )
     policy = stored.networks.policy
     lap, acted = drive_best_lap(evaluator, policy)
@@ -307,4 +306,4 @@ def film_run(
     setup = evaluator.race.setup
     frames = Frames(lap, acted, policy, setup.actions, setup.observation, setup.car)
     write_film(file, frames, len(frames), (WIDTH, HEIGHT), err)
-    out.print(f"  film  {file}", soft_wrap=True, highlight=False)
+    out.print(f"  film  {file}", soft_wrap=True)

@@ -101,7 +101,7 @@ class EvalCallback(Callback):
         here is the one that was never interrupted.
         """
         if self._evaluator is not None and trainer.iteration and not self._is_due(trainer.iteration):
-            self._console.print(f"evaluating the policy of iteration {trainer.iteration}", highlight=False)
+            self._console.print(f"evaluating the policy of iteration {trainer.iteration}")
             self._evaluate(trainer)
 
     def _is_due(self, iteration: int) -> bool:
@@ -258,7 +258,7 @@ class TrackingCallback(Callback):
         self._tracker.set_tag(END_TAG, str(result.ending))
         if self._tracker.outage is not None:
             line = f"{self._tracker.outage}; waiting for at most {FINISH_S:g} s"
-            self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+            self._console.print(line, soft_wrap=True)
         self._tracker.finish(ENDS.get(result.status, "KILLED"))
         result.unrecorded = self._tracker.failure
 

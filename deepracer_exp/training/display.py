@@ -183,7 +183,7 @@ class ProgressDisplay:
 
     def _print(self, text: str) -> None:
         # Names and paths may hold square brackets, and a log line is not folded at 80 columns.
-        self._console.print(text, markup=False, highlight=False, emoji=False, soft_wrap=True)
+        self._console.print(text, soft_wrap=True)
 
     def _line(self) -> str:
         share = self._figure(_SHARE)

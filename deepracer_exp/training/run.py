@@ -371,7 +371,7 @@ def _print_lines(lines: Sequence[str], console: Console) -> None:
 
 def _printing(console: Console) -> Callable[[str], None]:
     """Return what prints a line as it is, above the view of the progress where that is shown."""
-    return lambda line: console.print(line, markup=False, highlight=False, soft_wrap=True)
+    return lambda line: console.print(line, soft_wrap=True)
 
 
 def _run(trainer: Trainer, interruption: Interruption) -> TrainResult:

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from deepracer_exp.aws.worlds.catalogue import UNITS_PER_M
 from deepracer_exp.aws.worlds.routes import recognise
@@ -79,7 +79,7 @@ def validate_reward(
     """
     check = read(plan.experiment, plan.files)
     setup = check.setup
-    out.print(f"[bold]{escape(setup.reward.name)}[/bold] on {escape(setup.track.title)}\n", highlight=False)
+    out.print(Text.assemble((setup.reward.name, "bold"), f" on {setup.track.title}\n"))
     _print_aws(out, check.aws)
     waypoints = setup.track.waypoints
     same = recognise(waypoints, np.arange(len(waypoints)))[:1]
@@ -319,7 +319,7 @@ def _default_picture(experiment: Experiment, check: Check) -> Path:
 
 def _line(out: Console, text: str, style: str | None = None) -> None:
     """Print one line without markup; a terminal may wrap it, a file gets it whole."""
-    out.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
+    out.print(text, style=style, soft_wrap=True)
 
 
 def _print_aws(out: Console, findings: list[AwsFinding]) -> None:
@@ -346,10 +346,10 @@ def _print_situations(out: Console, check: Check) -> None:
     table = Table("situation", box=None, pad_edge=False, padding=(0, 3, 0, 0), header_style="dim")
     table.add_column("reward", justify="right")
     for name, answer in check.tried.items():
-        how = "[dim]-[/dim]" if answer.failure == NOT_CALLED else "[red]failed[/red]"
+        how = Text("-", "dim") if answer.failure == NOT_CALLED else Text("failed", "red")
         table.add_row(name, f"{answer.reward:.4g}" if answer.failure is None else how)
     out.print()
-    out.print(table, highlight=False)
+    out.print(table)
     out.print()
 
 
@@ -362,7 +362,7 @@ def _print_laps(out: Console, check: Check) -> None:
         table.add_column(name, justify="right")
     for lap in check.laps:
         table.add_row(f"{lap.time_s:.2f} s", f"{lap.total:.4g}", f"{lap.discounted:.4g}")
-    out.print(table, highlight=False)
+    out.print(table)
     out.print()
 
 

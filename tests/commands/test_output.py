@@ -1,11 +1,16 @@
 """What a training prints at its end."""
 
+import ast
+import io
 import json
 from pathlib import Path
 
 import pytest
+from rich.table import Table
+from rich.tree import Tree
 
-from deepracer_exp.commands.output import print_result, print_steps, print_unsent
+import deepracer_exp
+from deepracer_exp.commands.output import plain_console, print_result, print_steps, print_unsent
 from deepracer_exp.config.running import MLflowTracking
 from deepracer_exp.runs.result import Ending
 from deepracer_exp.training.callback import TrainResult
@@ -108,3 +113,28 @@ def test_what_mlflow_lacks_of_a_sweep_is_counted_with_the_command_that_sends_it(
     (tmp_path / "runs" / "study" / "run-1" / "summary.json").unlink()  # it runs again
     print_unsent(Path("runs/study"))
     assert "something of 1 run was" in capsys.readouterr().err
+
+
+def test_consoles_print_the_words_of_users_as_they_are():
+    words = "[bold] [reinvent_base] [/dim] :car: 12"
+    file = io.StringIO()
+    console = plain_console(file=file, force_terminal=True, color_system="truecolor", width=60)
+    table = Table(words, box=None)
+    table.add_row(words)
+    console.print(words, table, Tree(words))
+    assert [line.rstrip() for line in file.getvalue().splitlines()].count(words) >= 2
+    assert file.getvalue().count(words) == 4
+
+
+def test_no_other_console_prints():
+    package = Path(deepracer_exp.__file__).parent
+    made = {
+        (
+            str(file.relative_to(package)),
+            tuple(keyword.arg for keyword in call.keywords if keyword.arg == "quiet"),
+        )
+        for file in package.rglob("*.py")
+        for call in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Console"
+    }
+    assert {file for file, quiet in made if not quiet} == {"commands/output.py"}

@@ -3,8 +3,7 @@
 import io
 from types import SimpleNamespace
 
-from rich.console import Console
-
+from deepracer_exp.commands.output import plain_console
 from deepracer_exp.sweeps.queue.claims import Claim
 from deepracer_exp.sweeps.report.view import SweepView
 from deepracer_exp.sweeps.trial import SeedRun, Trial
@@ -25,7 +24,7 @@ def claim(number, state=None, values=None, share=0.0, params=None, **attrs):
 
 def shown(claims, is_terminal=True, first=(), after_s=0.0):
     text = io.StringIO()
-    console = Console(file=text, force_terminal=is_terminal, width=100, height=30, color_system=None)
+    console = plain_console(file=text, force_terminal=is_terminal, width=100, height=30, color_system=None)
     with SweepView(WORKER_CONFIG, 2, console) as view:
         view.show(first)
         view._began -= after_s
@@ -82,3 +81,13 @@ def test_without_a_terminal_each_trial_that_ends_is_a_line():
         "trial 1 pruned (collapsed) after 4,096 steps: collapsed: entropy 0.01; 2 of 4, about"
     )
     assert len(lines) == 3
+
+
+def test_values_keep_their_brackets():
+    ended = claim(0, "COMPLETE", [8.25], params={"track": "[reinvent_base]"}, completion=98.0)
+    assert (
+        shown([ended], is_terminal=False)
+        .splitlines()[1]
+        .startswith("trial 0 with track [reinvent_base] done")
+    )
+    assert "track [bold]" in shown([claim(1, params={"track": "[bold]"})])

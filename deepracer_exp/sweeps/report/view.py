@@ -72,7 +72,7 @@ class SweepView:
             self._live.update(self._panel(claims, stage), refresh=True)
 
     def _line(self, text: str) -> None:
-        self._console.print(text, highlight=False, soft_wrap=True)
+        self._console.print(text, soft_wrap=True)
 
     def _follow(self, claim: Claim) -> None:
         completion = claim.progress.get("completion")
