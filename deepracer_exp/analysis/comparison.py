@@ -8,11 +8,13 @@ from deepracer_exp.config.stored import ABSENT as NOTHING
 from deepracer_exp.runs.files import RunRecord
 from deepracer_exp.runs.result import FIGURES, result_of
 
+from .charts.style import shortened
+
 
 def value_text(value: Any, most: int = 48) -> str:
     """Return a value as YAML has it, shortened in its middle."""
     text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
-    return text if len(text) <= most else f"{text[: most - 15]} … {text[-12:]}"
+    return shortened(text, most)
 
 
 def last_value(record: RunRecord, column: str) -> float | None:

@@ -149,8 +149,8 @@ def difference(scores: Strata, other: Strata, lower_is_better: bool) -> Differen
     both, rng = [*ours, *theirs], np.random.default_rng(0)
     varies = _freedom(both) >= LEAST_FOR_INTERVAL - 1
     drawn, drawn_theirs = ([_resampled(cell, rng) for cell in some] for some in (ours, theirs))
-    apart = float(interquartile_mean(np.concatenate(ours)) - interquartile_mean(np.concatenate(theirs)))
     with np.errstate(invalid="ignore"):  # infinity minus infinity
+        apart = float(interquartile_mean(np.concatenate(ours)) - interquartile_mean(np.concatenate(theirs)))
         resampled = np.subtract(
             *(interquartile_mean(np.concatenate(some, axis=1)) for some in (drawn, drawn_theirs))
         )

@@ -10,7 +10,7 @@ from deepracer_exp.runs.result import result_of
 
 from .evidence import Estimate, Interval
 from .group_curves import curves_table
-from .groups import COMPARED, FORMS, Comparison, RunGroup, courses_of
+from .groups import FORMS, VERDICT, Comparison, RunGroup, courses_of
 from .log_tables import NONE, Table
 
 
@@ -33,7 +33,9 @@ def figure_text(figure: str, estimate: Estimate | None) -> str:
         return NONE
     form = FORMS[figure][1]
     middle = form.format(estimate.iqm) if math.isfinite(estimate.iqm) else "no lap"
-    return middle if estimate.interval is None else f"{middle} ({_ends(form, estimate.interval)})"
+    if estimate.interval is None or not math.isfinite(min(estimate.interval)):
+        return middle
+    return f"{middle} ({_ends(form, estimate.interval)})"
 
 
 def _ends(form: str, interval: Interval) -> str:
@@ -41,7 +43,8 @@ def _ends(form: str, interval: Interval) -> str:
 
 
 def differences_table(comparisons: Sequence[Comparison]) -> Table:
-    """Return comparisons as texts."""
+    """Return comparisons as texts; a column names the groups where there are several."""
+    many = len({comparison.group for comparison in comparisons}) > 1
     several = len({comparison.course for comparison in comparisons}) > 1
     rows = []
     for comparison in comparisons:
@@ -57,19 +60,37 @@ def differences_table(comparisons: Sequence[Comparison]) -> Table:
             "" if chance is None else f" ({chance[0]:.0%} to {chance[1]:.0%})"
         )
         track = [comparison.course or "all tracks"] * several
-        rows.append((comparison.group, *track, name, comparison.verdict, change, better))
-    heads = ("group", *["track"] * several, "figure", "verdict", "difference", "probability of improvement")
-    return Table(heads, tuple(rows), 3 + several)
+        group = [comparison.group] * many
+        rows.append((*group, *track, name, comparison.verdict, change, better))
+    heads = ("figure", "verdict", "difference", "probability of improvement")
+    return Table((*["group"] * many, *["track"] * several, *heads), tuple(rows), 2 + many + several)
+
+
+def title_of(comparisons: Sequence[Comparison]) -> str:
+    """Return what a table of comparisons is about: ``new against old``, or ``Against old`` of several groups."""
+    names = {comparison.group for comparison in comparisons}
+    return (
+        f"{names.pop()} against {comparisons[0].other}"
+        if len(names) == 1
+        else f"Against {comparisons[0].other}"
+    )
 
 
 def sentences(groups: Sequence[RunGroup], comparisons: Sequence[Comparison]) -> list[str]:
-    """Return what the tables say, in sentences: the verdict on the lap first."""
+    """Return what the tables say, in sentences: first how each group differs from the first one, and if by chance."""
     alone = len(courses_of(groups)) == 1
+    single = all(len(group.records) == 1 for group in groups)
+    verdicts: dict[str, list[Comparison]] = {}
+    for comparison in comparisons:
+        if comparison.figure in VERDICT and (comparison.course is None or alone):
+            verdicts.setdefault(comparison.group, []).append(comparison)
     lines = [
-        f"{comparison.group} against {comparison.other}, lap of the evaluated policy: {comparison.verdict}."
-        for comparison in comparisons
-        if comparison.figure == COMPARED[0] and (comparison.course is None or alone)
+        f"{name} against {groups[0].name}: {'; '.join(one.words for one in some)}."
+        + " Too few runs to tell this from chance." * (not single and not some[0].difference.enough)
+        for name, some in verdicts.items()
     ]
+    if single:
+        lines.append("Each run is alone: nothing says how much of a difference is chance. Train more seeds.")
     results = [result_of(record.summary) for group in groups for record in group.records]
     lacking = sum(result is None or not result.evaluated for result in results)
     if lacking:

@@ -18,14 +18,13 @@ from deepracer_exp.runs.result import FIGURES, result_of
 from .evidence import Difference, Estimate, difference, estimate, interquartile_mean
 from .statistics import Values
 
-COMPARED = ("lap_time_s", "completion", "race_score_s")
-"""The figures in which groups are held against each other: attributes of RunResult."""
 FORMS = {attribute: (name, form, better) for name, attribute, form, better in FIGURES}
-"""Name and unit, format and direction of each figure."""
+"""Name and unit, format and direction of each figure in which groups are compared: attributes of RunResult."""
 _NOT_OF_GROUP = ("seed", "name", "code")
 _UNNAMED = ("seed", "name", "runs_dir", "tracking", "report", "debug", "track")
 """Keys of overrides that are no part of a group's name."""
-_MOST_WORDS = 3
+_MOST_WORDS, _MOST_LETTERS = 3, 44
+"""Settings in the name of a group, and their letters in all; there is at least one."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +98,7 @@ def group_runs(named: Iterable[tuple[str | None, RunRecord]]) -> list[RunGroup]:
     labels = _labels([records[number] for number in open_groups.values()])
     if len(set(labels)) < len(labels):
         labels = [
-            ", ".join(f"{key}={value_text(differences[key][number], 24)}" for key in deciding[:_MOST_WORDS])
+            _label(f"{key}={value_text(differences[key][number], 24)}" for key in deciding)
             for number in open_groups.values()
         ]
     for number, (key, label) in enumerate(zip(open_groups, labels, strict=True), 1):
@@ -114,17 +113,26 @@ def _labels(records: Sequence[RunRecord]) -> list[str]:
     """Return a name for each run: the overrides in which it differs from the others."""
     chosen = [_overrides(record.path) for record in records]
     keys = dict.fromkeys(key for words in chosen for key in words)
-    differing = [key for key in keys if len({words.get(key) for words in chosen}) > 1]
+    distinct = {key: len({words.get(key) for words in chosen}) for key in keys}
+    # The keys that say most come first, since not all have room.
+    differing = sorted((key for key in keys if distinct[key] > 1), key=lambda key: -distinct[key])
     if not differing:
         return [str(record.config.get("name") or record.name) for record in records]
-    labels = []
-    for record, words in zip(records, chosen, strict=True):
-        settings = [
-            f"{key}={words[key] if key in words else _default(record.config, key)}" for key in differing
-        ]
-        more = [f"and {len(settings) - _MOST_WORDS} more"] * (len(settings) > _MOST_WORDS)
-        labels.append(" ".join([*settings[:_MOST_WORDS], *more]))
-    return labels
+    return [
+        _label(f"{key}={value_text(words.get(key, _default(record.config, key)), 24)}" for key in differing)
+        for record, words in zip(records, chosen, strict=True)
+    ]
+
+
+def _label(settings: Iterable[str]) -> str:
+    """Return as many settings as a name has room for, and the number of the others."""
+    words = list(settings)
+    shown = words[:1]
+    for word in words[1:_MOST_WORDS]:
+        if len(" ".join([*shown, word])) > _MOST_LETTERS:
+            break
+        shown.append(word)
+    return " ".join([*shown, *[f"and {len(words) - len(shown)} more"] * (len(words) > len(shown))])
 
 
 def _overrides(run: Path) -> dict[str, str]:
@@ -146,12 +154,26 @@ def _default(config: Mapping[str, Any], key: str) -> str:
         value = value.get(part) if isinstance(value, Mapping) else None
     if isinstance(value, Mapping):
         value = value.get("name", "default")
-    return value_text(value, 24)
+    return value_text(value)
 
 
 def courses_of(groups: Sequence[RunGroup]) -> list[str]:
     """Return all tracks of groups."""
     return list(dict.fromkeys(course for group in groups for course in group.courses))
+
+
+_WORDS = {
+    "lap_time_s": ("faster", "slower", "as fast", "a lap"),
+    "laps_percent": ("surer", "less sure", "as sure", "of usual laps complete"),
+    "held_out_completion": ("more robust", "less robust", "as robust", "of held-out completion"),
+}
+"""Words for better, worse and the same in the figures that a verdict names, and of what the amount is."""
+VERDICT = tuple(_WORDS)
+_WITHOUT_LAP = {
+    1: "faster: the other completes too few laps for a time",
+    0: "neither completes enough laps for a time",
+    -1: "slower: it completes too few laps for a time",
+}
 
 
 @dataclass(frozen=True)
@@ -168,8 +190,34 @@ class Comparison:
     @property
     def verdict(self) -> str:
         """Return in words whether the groups differ."""
-        words = ("faster", "slower") if self.figure == "lap_time_s" else ("better", "worse")
-        return self.difference.verdict(*words)
+        better, worse, _, _ = _WORDS.get(self.figure, ("better", "worse", "", ""))
+        return self.difference.verdict(better, worse)
+
+    @property
+    def words(self) -> str:
+        """Return in words by how much they differ: ``faster by 1.00 s a lap (0.83 to 1.11, not chance)``.
+
+        Where there are too few runs to tell, there is no word on chance.
+        """
+        better, worse, same, tail = _WORDS[self.figure]
+        apart, lower_is_better = self.difference, FORMS[self.figure][2] < 0
+        if apart.iqm is None:
+            return _WITHOUT_LAP[(apart.probability > 0.5) - (apart.probability < 0.5)]
+        form = "{:.1f}" if self.course is None else FORMS[self.figure][1]
+        unit = "%" if self.course is None else " s" if self.figure == "lap_time_s" else " points"
+        amount = form.format(abs(apart.iqm))
+        gains = (apart.iqm < 0) == lower_is_better
+        if not float(amount):
+            return same
+        words = f"{better if gains else worse} by {amount}{unit} {tail}"
+        if not apart.enough:
+            return words
+        chance = "may be chance" if apart.explained_by_seeds else "not chance"
+        if apart.interval is None:
+            return f"{words} ({chance})"
+        # In the direction of the word, so that an interval on both sides of zero has one negative end.
+        low, high = apart.interval if apart.iqm > 0 else (-apart.interval[1], -apart.interval[0])
+        return f"{words} ({form.format(low)} to {form.format(high)}, {chance})"
 
 
 def compared(groups: Sequence[RunGroup]) -> list[Comparison]:
@@ -178,7 +226,7 @@ def compared(groups: Sequence[RunGroup]) -> list[Comparison]:
     first, *others = groups
     for other in others:
         common = [course for course in first.courses if course in other.courses]
-        for figure in COMPARED:
+        for figure in FORMS:
             cells = []
             for course in common:
                 pair = other.on(course).scores(figure), first.on(course).scores(figure)

@@ -124,28 +124,28 @@ def _show(
     """Print what is compared and write the page."""
     from deepracer_exp.analysis.charts.groups import best_checkpoints, learning_curve_charts
     from deepracer_exp.analysis.charts.runs import generalisation_matrix, stored_completion
-    from deepracer_exp.analysis.group_tables import differences_table, scored, sentences
+    from deepracer_exp.analysis.group_tables import differences_table, scored, sentences, title_of
     from deepracer_exp.analysis.groups import RunGroup, compared, course_of
 
     single = all(len(group.records) == 1 for group in groups)
-    tables: list[tuple[str, Table, str]] = []
     if single:
         letters = dict(zip(ascii_uppercase, groups, strict=False))
-        groups = [RunGroup(f"{letter}  {group.name}", group.records) for letter, group in letters.items()]
-        notes = ["Each run is alone: nothing says how much of a difference is chance. Train more seeds."]
-    else:
-        differences = compared(groups)
-        notes = sentences(groups, differences)
+        groups = [RunGroup(f"{group.name} ({letter})", group.records) for letter, group in letters.items()]
+    differences = compared(groups)
+    notes = sentences(groups, differences)
+    configuration, *others = _run_tables(groups)
+    tables = [configuration]
+    if not single:
         tables.append(("Groups", scored(groups), _SCORED))
         if differences:
-            tables.append((f"Against {groups[0].name}", differences_table(differences), _DIFFERENCES))
+            tables.append((title_of(differences), differences_table(differences), _DIFFERENCES))
+    tables += others
     if of_all > len(groups):
         notes.append(f"{of_all} groups: shown are the {len(groups)} with the best race score.")
     shown = [record for group in groups for record in group.records]
-    tables += _run_tables(groups)
     charts = [
         *learning_curve_charts(groups),
-        best_checkpoints(groups),
+        None if single else best_checkpoints(groups),
         _generations(shown),
         generalisation_matrix(
             [(record.name, course_of(record), stored_completion(record.path)) for record in shown]
@@ -163,7 +163,7 @@ def _show(
 
 
 def _run_tables(groups: "Sequence[RunGroup]") -> "list[tuple[str, Table, str]]":
-    """Return which runs there are, what each achieved, and in which settings they differ.
+    """Return in which settings runs differ, what each achieved, and which there are.
 
     Of several groups with several runs, settings are those of the groups, and the results of each run are left out.
     """
@@ -182,13 +182,13 @@ def _run_tables(groups: "Sequence[RunGroup]") -> "list[tuple[str, Table, str]]":
         named = list(zip(heads, (str(record.path) for record in records), strict=False))
         achieved = [(name, *texts) for name, texts, _ in results(records[: len(heads)])]
         tables = [
-            (_RUNS, Table(("", "run"), tuple(named), 2), ""),
             ("Results", Table(("", *heads), tuple(achieved), 1), ""),
+            (_RUNS, Table(("", "run"), tuple(named), 2), ""),
         ]
     differences = run_differences(records[: len(heads)]).items()
     chosen = [(key, *map(value_text, values)) for key, values in differences if key not in ignored]
     table = Table(("", *heads), tuple(chosen), 1 + len(heads))
-    return [*tables, ("Configuration", table, "" if chosen else "No difference.")]
+    return [("Configuration", table, "" if chosen else "No difference."), *tables]
 
 
 def _generations(records: "Sequence[RunRecord]") -> "Chart | None":

@@ -182,7 +182,7 @@ def print_results(outcomes: "Sequence[TrainResult]", tracking: "TrackingConfig")
 
 def _print_groups(runs: "Sequence[Path]") -> None:
     """Print the tables of groups, where one of them has several runs."""
-    from deepracer_exp.analysis.group_tables import differences_table, scored, sentences
+    from deepracer_exp.analysis.group_tables import differences_table, scored, sentences, title_of
     from deepracer_exp.analysis.groups import compared, group_runs
     from deepracer_exp.lookup.next_steps import own_word
     from deepracer_exp.runs.files import read_head
@@ -194,7 +194,7 @@ def _print_groups(runs: "Sequence[Path]") -> None:
     console.print()
     print_table(console, "Groups", scored(groups))
     if differences:
-        print_table(console, f"Against {groups[0].name}", differences_table(differences))
+        print_table(console, title_of(differences), differences_table(differences))
     for sentence in sentences(groups, differences):
         console.print(sentence, soft_wrap=True)
     words = shlex.join(own_word(run) for run in runs)

@@ -121,3 +121,9 @@ def test_a_band_needs_half_of_the_curves_and_three_of_them() -> None:
     assert np.isfinite(low).tolist() == np.isfinite(high).tolist() == [True, True, False]
     assert (low[0], high[0]) == estimate([curves[:, 0]]).interval
     assert np.isnan(iqm_band(curves[:2])[1:]).all()
+
+
+def test_groups_without_a_lap_are_compared_without_a_warning(recwarn):
+    nothing = np.full(3, np.inf)
+    assert difference([nothing], [nothing], True).iqm is None
+    assert not recwarn.list

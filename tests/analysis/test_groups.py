@@ -1,6 +1,7 @@
 """Groups of runs: which there are, what they scored, whether they differ, and how they are drawn."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -92,9 +93,69 @@ def test_a_difference_is_found_on_each_track_and_on_all_of_them_in_shares_of_the
     assert laps[2].difference.iqm == pytest.approx(-100 / 8.5, rel=0.01)
     completion = next(one for one in compared(two) if one.figure == "completion")
     assert completion.verdict == SAME
-    told = sentences(two, compared(two))
-    assert told == ["algorithm.lr=1e-3 against algorithm.lr=1e-4, lap of the evaluated policy: faster."]
-    assert any("% of the track's mean" in row[2] for row in differences_table(compared(two)).rows)
+    (verdict,) = sentences(two, compared(two))
+    assert verdict.startswith(
+        "algorithm.lr=1e-3 against algorithm.lr=1e-4: faster by 11.8% a lap (10.9 to 12.5"
+    )
+    assert verdict.endswith("not chance); as sure; as robust.")
+    assert any("% of the track's mean" in row[1] for row in differences_table(compared(two)).rows)
+
+
+def verdict_of(tmp_path: Path, laps_s: tuple[float | None, ...], other_s: tuple[float | None, ...]) -> str:
+    """Return the words on the laps of runs against those of others."""
+    groups = [
+        RunGroup(
+            name, tuple(made_up_run(tmp_path / f"{name}{k}", lap_s=lap_s) for k, lap_s in enumerate(some))
+        )
+        for name, some in (("old", other_s), ("new", laps_s))
+    ]
+    return compared(groups)[0].words
+
+
+@pytest.mark.parametrize(
+    ("laps_s", "words"),
+    [
+        ((8.0, 8.1, 8.2, 8.3, 8.4), "faster by 0.80 s a lap (0.50 to 1.07, not chance)"),
+        ((10.0, 10.1, 10.2, 10.3, 10.4), "slower by 1.20 s a lap (0.90 to 1.47, not chance)"),
+        ((8.9, 8.95, 9.0, 9.1, 9.15), "may be chance)"),
+        ((9.2, 9.1, 9.0, 8.9, 8.8), "as fast"),
+        ((None,) * 5, "slower: it completes too few laps for a time"),
+        ((8.0,), "faster by 1.00 s a lap"),
+    ],
+)
+def test_a_verdict_has_a_number_its_interval_and_whether_it_is_chance(tmp_path, laps_s, words):
+    assert verdict_of(tmp_path, laps_s, (8.8, 8.9, 9.0, 9.1, 9.2)).endswith(words)
+
+
+def test_a_run_without_a_lap_is_slower_than_any(tmp_path):
+    words = verdict_of(tmp_path, (8.0,), (None,))
+    assert words == "faster: the other completes too few laps for a time"
+
+
+def test_an_interval_that_holds_zero_has_one_end_against_the_word(tmp_path):
+    words = verdict_of(tmp_path, (8.7, 8.9, 8.9, 9.1, 9.2), (8.8, 8.9, 9.0, 9.1, 9.2))
+    assert re.fullmatch(r"faster by 0.03 s a lap \(-0\.\d\d to 0\.\d\d, may be chance\)", words)
+
+
+def test_names_are_short_and_still_distinguish(tmp_path):
+    common = ["algorithm.frames_per_iteration=4096", "network=mlp"]
+    runs = [
+        made_up_run(tmp_path / str(number), words)
+        for number, words in enumerate(
+            [
+                [*common, "reward=racing_line"],
+                [*common, "reward=follow_center_line"],
+                ["reward=progress_delta"],
+            ]
+        )
+    ]
+    names = [group.name for group in group_runs(alone(runs))]
+    assert [name.partition(" ")[0] for name in names] == [
+        "reward=racing_line",
+        "reward=follow_center_line",
+        "reward=progress_delta",
+    ]
+    assert all(name.endswith("more") and len(name) < 70 for name in names)
 
 
 def test_seeds_that_overlap_and_few_of_them_are_called_that(tmp_path):
@@ -113,7 +174,7 @@ def test_runs_without_a_lap_are_slower_than_any_and_those_without_a_result_are_l
     ]
     (tmp_path / "none4" / "summary.json").unlink()
     groups[1] = RunGroup("none", (*groups[1].records[:4], read_record(tmp_path / "none4")))
-    assert scored(groups).rows[1][-1] == "no lap (no lap to no lap)"
+    assert scored(groups).rows[1][-1] == "no lap"
     lap = compared(groups)[0]
     assert (lap.difference.iqm, lap.verdict) == (None, "slower")
     assert "1 run without an evaluation, or not ended: left out of the figures." in sentences(groups, [lap])
@@ -147,6 +208,14 @@ def test_curves_have_bands_over_seeds_and_gaps_where_no_lap_was_completed(two, t
     assert [line.name for line in layers(panel, "line")] == [group.name for group in two]
     np.testing.assert_allclose(layers(panel, "line")[1].y, [12, 11, 10, 9, 8], rtol=1e-6)
     assert "over 5 runs" in charts[0].caption
+    (chart,) = learning_curve_charts(
+        [
+            RunGroup("none", (made_up_run(tmp_path / "first", lap_s=None),)),
+            RunGroup("laps", two[0].records[:1]),
+        ]
+    )
+    lines = [line for row in chart.rows for panel in row for line in layers(panel, "line")]
+    assert sorted(line.name for line in lines if line.name) == ["laps", "none"]
     none = RunGroup("none", (made_up_run(tmp_path / "none", lap_s=None),))
     (chart,) = learning_curve_charts([none])
     titles = [panel.title for row in chart.rows for panel in row]

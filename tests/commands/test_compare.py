@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -49,7 +50,8 @@ def test_an_experiment_is_compared_by_what_differs_besides_the_seed(study, call,
     ended = call("compare", what)
     assert ended.code == 0, ended.stderr
     said = lines(ended.stdout)
-    assert "algorithm.lr=1e-4 against algorithm.lr=1e-3, lap of the evaluated policy: slower." in said
+    (verdict,) = (line for line in said if line.startswith("algorithm.lr=1e-4 against algorithm.lr=1e-3: "))
+    assert re.search(r"slower by 1.00 s a lap \(0.\d\d to 1.\d\d, not chance\); as sure; as robust", verdict)
     assert any(line.startswith("algorithm.lr=1e-3 5 8.00 (") for line in said)
     assert said[-1] == "page study-comparison.html"
     page = page_of(ended.cwd / "study-comparison.html")
@@ -57,16 +59,22 @@ def test_an_experiment_is_compared_by_what_differs_besides_the_seed(study, call,
     assert not page.loads
     for line in said[:3]:
         assert line in page.text
+    # The verdict comes first, what differs after it.
+    places = [page.text.index(words) for words in (verdict, "algorithm.lr 0.001 0.0001", "8.00 (")]
+    assert places == sorted(places)
 
 
 def test_experiments_and_groups_of_ones_own_keep_their_names(study, call, tmp_path):
     made_up_seeds(tmp_path / "runs" / "other", [], 7.0)
     said = call("compare", "other", "study").stdout
-    assert "study: algorithm.lr=1e-3 against other, lap of the evaluated policy: slower." in said
+    assert "study: algorithm.lr=1e-3 against other: slower by 1.00 s a lap (" in said
     names = [one.name for one in sorted(study.iterdir())]
     ended = call("compare", f"mine={names[0]},{names[1]}", f"theirs={','.join(names[5:])}", "-o", "mine.html")
     assert ended.code == 0, ended.stderr
-    assert "theirs against mine, lap of the evaluated policy: too few runs to tell." in ended.stdout
+    assert (
+        "theirs against mine: slower by 1.08 s a lap; as sure; as robust. Too few runs to tell"
+        in ended.stdout
+    )
     assert "mine, theirs compared" in page_of(tmp_path / "mine.html").text
 
 
@@ -80,6 +88,11 @@ def test_single_runs_stand_side_by_side(call, tmp_path):
     for row in ("A runs/e/first", "seed 1 2", "algorithm.lr 0.0001 0.001", "mean usual lap, s 10.00 9.25"):
         assert row in said
         assert row in text
+    verdict = (
+        "algorithm.lr=1e-3 (B) against algorithm.lr=1e-4 (A): faster by 0.75 s a lap; as sure; as robust."
+    )
+    assert verdict in ended.stdout
+    assert verdict in text
     assert "nothing says how much of a difference is chance" in ended.stdout
     # Alike but for their seed, they are one group.
     made_up_run(tmp_path / "runs" / "e" / "third", ["seed=3", "algorithm.lr=1e-3"], 9.0)

@@ -8,7 +8,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from .style import DIVERGING, INK, PAPER, SCALE, VEIL, escaped
+from .style import DIVERGING, INK, PAPER, SCALE, VEIL, escaped, shortened
+
+_LONGEST_NAME = 48
+"""Letters of a name in a legend, which has no more room in half a page or on a phone."""
 
 _MANY = 500
 """Points from which on they are drawn half transparent."""
@@ -261,7 +264,7 @@ def _light(values: ArrayLike) -> NDArray[np.float32]:
 
 
 def _named(name: str | None) -> dict[str, Any]:
-    return {"name": escaped(name or ""), "showlegend": name is not None}
+    return {"name": escaped(shortened(name or "", _LONGEST_NAME)), "showlegend": name is not None}
 
 
 def _hover(hover: Sequence[str] | None) -> dict[str, Any]:

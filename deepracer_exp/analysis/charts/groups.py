@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from deepracer_exp.analysis.group_curves import CURVES, group_curve
-from deepracer_exp.analysis.groups import COMPARED, FORMS, RunGroup, courses_of
+from deepracer_exp.analysis.groups import FORMS, RunGroup, courses_of
 
 from .figure import Chart, Layer, Panel, band, in_rows, line, points
 from .style import BLUE, CATEGORIES, ORANGE
@@ -36,6 +36,7 @@ def _learning_curves(groups: Sequence[RunGroup], course: str, several: bool) -> 
     )
     factor, unit = (1e-6, "million control steps") if longest >= 2e6 else (1e-3, "thousand control steps")
     panels: list[Panel] = []
+    named: set[str] = set()
     for column in CURVES:
         layers: list[Layer] = []
         for number, group in here:
@@ -43,7 +44,9 @@ def _learning_curves(groups: Sequence[RunGroup], course: str, several: bool) -> 
             if not table["iqm"].notna().any():
                 continue
             color, dashed = CATEGORIES[number % len(CATEGORIES)], number >= len(CATEGORIES)
-            steps, name = factor * table["env_steps"], None if panels else group.name
+            # A group that completes no lap is not in the first panel.
+            steps, name = factor * table["env_steps"], None if group.name in named else group.name
+            named.add(group.name)
             if table["low"].notna().any():
                 layers.append(band(steps, table["low"], table["high"], color))
             layers.append(line(steps, table["iqm"], color, name, width=2.5, dashed=dashed))
@@ -80,7 +83,7 @@ def best_checkpoints(groups: Sequence[RunGroup]) -> Chart | None:
     several = len(courses_of(groups)) > 1
     names = [group.name + f" on {course}" * several for group, course in places]
     panels = []
-    for figure in COMPARED:
+    for figure in FORMS:
         layers: list[Layer] = []
         for place, (group, course) in enumerate(places):
             runs = group.on(course)
@@ -89,15 +92,13 @@ def best_checkpoints(groups: Sequence[RunGroup]) -> Chart | None:
             if not len(finite) or estimate is None:
                 continue
             spread = place + 0.4 * ((np.arange(len(finite)) + 0.5) / len(finite) - 0.5)
-            layers.append(points(spread, finite, BLUE, None if layers else "a run", size=8))
+            layers.append(points(finite, spread, BLUE, size=8))
             if estimate.interval is not None and np.isfinite([estimate.iqm, *estimate.interval]).all():
                 low, high = estimate.interval
-                layers.append(line([place, place, place], [low, estimate.iqm, high], ORANGE))
-                layers.append(points([place], [estimate.iqm], ORANGE, size=13, symbol="diamond"))
+                layers.append(line([low, estimate.iqm, high], [place, place, place], ORANGE))
+                layers.append(points([estimate.iqm], [place], ORANGE, size=13, symbol="diamond"))
         if layers:
-            name, x_range = FORMS[figure][0], (-0.5, len(places) - 0.5)
-            title = name.partition(",")[0].capitalize()
-            panels.append(Panel(title=title, y_label=name, layers=layers, x_names=names, x_range=x_range))
+            panels.append(Panel(x_label=FORMS[figure][0], layers=layers, y_names=names))
     if not panels:
         return None
     return Chart(
@@ -105,5 +106,5 @@ def best_checkpoints(groups: Sequence[RunGroup]) -> Chart | None:
         title="Best checkpoints",
         caption="Points are runs, by the evaluation of their best checkpoint; diamonds are interquartile means with "
         "their intervals (95 per cent). Runs without a complete lap have no point in seconds.",
-        rows=in_rows(panels, 3 if len(places) <= 4 else 1),
+        rows=[[panel] for panel in panels],
     )

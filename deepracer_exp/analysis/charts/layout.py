@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .figure import Annotation, Chart, Layer, Panel, Trace
-from .style import FAINT, GRID, INK, SPINE, WIDTH, Figure, base_layout, escaped
+from .style import FAINT, GRID, INK, SPINE, WIDTH, Figure, base_layout, escaped, shortened
 
 # All in pixels. Letters have mean widths: 9 in a panel's title, 7 in legends and names.
 _LEFT, _RIGHT, _COLOR_BAR = 74.0, 14.0, 86.0
@@ -210,7 +210,9 @@ def _axis_styles(box: _Box, axes: _Axes) -> dict[str, Any]:
     panel = box.panel
     heat = any(layer.get("type") == "heatmap" for layer in panel.layers)
     styles: list[dict[str, Any]] = []
-    for label, names in ((panel.x_label, panel.x_names), (panel.y_label, panel.y_names)):
+    letters = max(16, int((box.left - 24.0) / 7.2))
+    y_names = [shortened(name, letters) for name in panel.y_names]
+    for label, names in ((panel.x_label, panel.x_names), (panel.y_label, y_names)):
         style: dict[str, Any] = {
             "title": {"text": escaped(label), "standoff": 6, "font": {"size": 13}},
             "gridcolor": GRID,

@@ -77,6 +77,11 @@ def base_layout(title: str, width: float = WIDTH) -> dict[str, Any]:
     }
 
 
+def shortened(text: str, most: int) -> str:
+    """Return a text of at most so many letters, at least 16: what is too much is left out of its middle."""
+    return text if len(text) <= most else f"{text[: most - 15]} … {text[-12:]}"
+
+
 def escaped(text: str) -> str:
     """Return a text for Plotly, which interprets tags and entities as HTML does."""
     return html.escape(text, quote=False).replace("\n", "<br>")
