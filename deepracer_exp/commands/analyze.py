@@ -36,7 +36,7 @@ _EPILOG = """\
   deepracer-exp analyze my_model-20261126-101500 RUN        and what RUN's policy would have done on its pictures
 
 The page needs no network: the outcome and the next steps, findings in words, figures and tables, and what could not be
-read and why. `deepracer-exp compare` puts runs and logs beside each other.
+read and why. With --replay or --line alone no page is written. `deepracer-exp compare` puts runs and logs beside each other.
 """
 
 
@@ -85,7 +85,7 @@ def _analyze(args: argparse.Namespace) -> int:
     if (drive := drive_given(args)) is not None:
         return _analyze_drive(args, *drive)
 
-    from deepracer_exp.analysis.line_file import check_line_file, recorded_line, write_line
+    from deepracer_exp.analysis.line_file import check_line_file
 
     target_s = None if args.target is None else _seconds(args.target)
 
@@ -111,19 +111,22 @@ def _analyze(args: argparse.Namespace) -> int:
     from deepracer_exp.analysis.log_view import prepare
     from deepracer_exp.analysis.reward_replay import replay_reward
     from deepracer_exp.analysis.reward_terms import run_terms
-    from deepracer_exp.reports.lap_replay import laps_of_log
     from deepracer_exp.reports.log_report import LogPage, write_log_page
     from deepracer_exp.runs.files import read_config
     from deepracer_exp.runs.recording import is_traced_run, read_log
 
     log = read_log(place)
+    if _wants_laps_only(args):
+        view = prepare(log, args.track)
+        print(f"{view.name}: {headline(view)}\n")
+        _write_laps_asked_for(args, view, episode)
+        return 0
     try:
         config = read_config(place) if is_traced_run(place) else {}
     except BadInput:  # the page lists which files could not be read
         config = {}
     car = _car(config)
     view, terms = run_terms(prepare(log, args.track), car)
-    line = None if args.line is None else recorded_line(view, episode)
     best = None
     if config:
         from deepracer_exp.reports.best_drive import drive_best
@@ -131,18 +134,12 @@ def _analyze(args: argparse.Namespace) -> int:
         view, best = drive_best(view, place)
     if args.fastest:
         _find_fastest(view, place)
-    laps = None if args.replay is None else laps_of_log(view, None)
     replay = None if reward is None else replay_reward(view, reward, car)
     default = place / REPORT if is_traced_run(place) else page_name("analysis", view.name)
     out = Path(args.output or default)
     sentences = findings(view, target_s)
     with writing(f"--output {out}", "a file in a folder"):
         write_log_page(out, LogPage(view, sentences, replay, terms, best))
-    if laps is not None:
-        write_laps(args.replay, laps)
-    if line is not None:
-        with writing(f"--line {args.line}"):
-            write_line(Path(args.line), line[0])
 
     print(f"{view.name}: {result_in_words(view)}")
     if result_in_words(view) != headline(view):
@@ -159,11 +156,33 @@ def _analyze(args: argparse.Namespace) -> int:
     if view.problems:
         print(f"\n  {count(len(view.problems), 'problem')} while reading, the first: {view.problems[0]}")
     end_with_page(out, args.open)
+    _write_laps_asked_for(args, view, episode)
+    return 0
+
+
+def _wants_laps_only(args: argparse.Namespace) -> bool:
+    """Return whether a lap is asked for, and nothing of what the page shows."""
+    shown = args.output is not None or args.open or args.fastest
+    return not (shown or args.reward or args.target) and (args.replay is not None or args.line is not None)
+
+
+def _write_laps_asked_for(args: argparse.Namespace, view: "LogView", episode: int | None) -> None:
+    """Write the page of two laps and the line of one, where they are asked for, and print where they are.
+
+    Raises:
+        BadInput: the log has no such lap, or a file cannot be written.
+    """
+    from deepracer_exp.analysis.line_file import recorded_line, write_line
+    from deepracer_exp.reports.lap_replay import laps_of_log
+
+    line = None if args.line is None else recorded_line(view, episode)
     if args.replay is not None:
+        write_laps(args.replay, laps_of_log(view, None))
         print(f"  laps  {args.replay}")
     if line is not None:
+        with writing(f"--line {args.line}"):
+            write_line(Path(args.line), line[0])
         print(f"  line  {args.line} ({line[1]})")
-    return 0
 
 
 def _analyze_drive(args: argparse.Namespace, place: Path, run: str | None, overrides: list[str]) -> int:

@@ -27,11 +27,9 @@ def findings_told(page: Path) -> str:
 
 
 def test_a_run_is_analysed_into_its_folder_and_the_terminal_reports_what_stands_on_the_page(run_dir, call):
-    ended = call("analyze", str(run_dir), "--replay", "laps.html")
+    ended = call("analyze", str(run_dir))
     assert ended.code == 0, ended.stderr
     assert f"page  {run_dir / 'report.html'}" in ended.stdout
-    assert "laps  laps.html" in ended.stdout
-    assert "an ordinary lap" in (ended.cwd / "laps.html").read_text()
     text = findings_told(run_dir / "report.html")
     assert "16,384 control steps" in text
     printed = [line[5:] for line in ended.stdout.splitlines() if re.match(r"  \d  ", line)]
@@ -114,6 +112,23 @@ def test_code_from_elsewhere_is_not_run(run_dir, call, tmp_path):
     assert call("analyze", "theirs").code == 0
     assert call("analyze", "their_run").code == 0
     assert not (tmp_path / "trapped").exists()
+
+
+@pytest.mark.parametrize(
+    ("asked", "has_page"), [((), False), (("-o", "page.html"), True), (("--target", "9"), True)]
+)
+def test_laps_are_written_without_the_page_unless_that_is_asked_for_too(
+    run_dir, call, tmp_path, asked, has_page
+):
+    pages = [run_dir / "report.html", tmp_path / "page.html"]
+    pages[0].unlink(missing_ok=True)
+    ended = call("analyze", str(run_dir), "--replay", "laps.html", *asked)
+    assert ended.code == 0, ended.stderr
+    assert "16,384 control steps of training" in ended.stdout
+    assert ended.stdout.splitlines()[-1] == "  laps  laps.html"
+    assert "an ordinary lap" in (tmp_path / "laps.html").read_text()
+    assert any(page.exists() for page in pages) == has_page
+    assert ("  page  " in ended.stdout) == has_page
 
 
 def test_the_lap_whose_line_is_written_is_named_and_can_be_asked_for(run_dir, call, tmp_path):
