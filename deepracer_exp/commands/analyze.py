@@ -36,7 +36,8 @@ _EPILOG = """\
   deepracer-exp analyze my_model-20261126-101500 RUN        and what RUN's policy would have done on its pictures
 
 The page needs no network: the outcome and the next steps, findings in words, figures and tables, and what could not be
-read and why. With --replay or --line alone no page is written. `deepracer-exp compare` puts runs and logs beside each other.
+read and why. With --replay or --line alone no page is written. `deepracer-exp compare` puts runs and logs beside each
+other.
 """
 
 

@@ -1,6 +1,7 @@
 """`deepracer-exp runs list`: the runs of a folder or an MLflow server, filtered and sorted, as a table, JSON or CSV."""
 
 import argparse
+import contextlib
 import csv
 import datetime
 import json
@@ -9,6 +10,7 @@ import operator
 import re
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deepracer_exp.errors import BadInput, nearest
@@ -22,13 +24,15 @@ if TYPE_CHECKING:
 LIST = "list"
 _NONE = "\N{EN DASH}"
 _EPILOG = """\
-  deepracer-exp runs                                        the runs of runs/, newest first
+  deepracer-exp runs                                        the runs of runs/, newest first; a study is one line
+  deepracer-exp runs list --trials                          also the runs of studies, a line each
   deepracer-exp runs tracking.uri=http://HOST:5000          those that a server has, of everyone
   deepracer-exp runs list --where state=finished --where 'score_s<12' --sort score_s
   deepracer-exp runs list --where user=anna --where tag.car=blue --format csv > season.csv
 
-columns: run name state lap_s score_s exploring_laps exploring_lap_s began user host note id tag.KEY
+columns: run name state lap_s score_s exploring_laps exploring_lap_s began user host study trial note id tag.KEY
 conditions: COLUMN=VALUE  COLUMN!=VALUE  COLUMN<NUMBER  <=  >  >=  COLUMN~TEXT (contains it)
+With --where, --sort and the other formats each run of a study has its line, too.
 """
 _CONDITION = re.compile(r"([a-z_]+|tag\.[\w.-]+)\s*(!=|<=|>=|=|<|>|~)\s*(.*)", re.DOTALL)
 _ORDERS: dict[str, Callable[[float, float], bool]] = {
@@ -53,6 +57,7 @@ def add_list(actions: "argparse._SubParsersAction[argparse.ArgumentParser]") -> 
     listing.add_argument(
         "--where", action="append", default=[], metavar="CONDITION", help="only runs for which it holds"
     )
+    listing.add_argument("--trials", action="store_true", help="each run of a study, not one line for all")
     listing.add_argument("--sort", metavar="COLUMN", help="by this column, the smallest first")
     listing.add_argument("--reverse", action="store_true", help="in the opposite order")
     listing.add_argument("--format", choices=("table", "json", "csv"), default="table", help="of the output")
@@ -88,11 +93,29 @@ def _list(args: argparse.Namespace) -> int:
         writer.writeheader()
         writer.writerows(rows)
     elif rows:
-        _print_table(rows)
+        _print_table(rows if args.trials or args.where or args.sort else _folded(rows, stores.runs_dir))
     else:
         where = stores.runs_dir if stores.uri is None else stores.uri
         print(f"no runs in {where}" + " that meet the conditions" * bool(args.where))
     return 0
+
+
+def _folded(rows: "Sequence[Row]", runs_dir: Path) -> "Sequence[Row]":
+    """Return rows in which a study has one, with the figures of the run that `best:STUDY` means."""
+    from deepracer_exp.runs.listing import fold_studies
+
+    studies = {row["study"] for row in rows if row["study"] is not None}
+    if not studies:
+        return rows
+
+    from deepracer_exp.lookup.best import read_best_of_sweep
+
+    best_runs = {}
+    for study in studies:
+        with contextlib.suppress(BadInput):  # a damaged file hides no run
+            if (best := read_best_of_sweep(runs_dir / study)) is not None:
+                best_runs[study] = best.run_dir
+    return fold_studies(rows, best_runs)
 
 
 def _columns(rows: "Sequence[Row]") -> list[str]:

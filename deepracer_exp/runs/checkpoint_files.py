@@ -16,7 +16,8 @@ from .files import WRITTEN
 
 HASHES = "hashes.json"
 MANIFEST = "manifest.json"
-LINKS = ("best", "last", "fastest")
+BEST = "best"
+LINKS = (BEST, "last", "fastest")
 """Names of the best checkpoint, of the last one, and of the one that laps fastest of the reliable ones."""
 _PINNED = "pinned.json"
 _PINS = TypeAdapter(dict[str, list[str]])

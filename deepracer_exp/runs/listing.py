@@ -1,12 +1,26 @@
 """The runs of a folder as rows: what `deepracer-exp runs` lists."""
 
 import datetime
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import BadInput, count
 
-from .files import CONFIG, PROVENANCE, SUMMARY, full_name, read_object, read_run_id, run_folders
+from .checkpoint_files import BEST
+from .files import (
+    CHECKPOINTS,
+    CONFIG,
+    METRICS,
+    PROVENANCE,
+    SUMMARY,
+    full_name,
+    read_metrics,
+    read_object,
+    read_run_id,
+    run_folders,
+)
 from .labels import read_labels
 
 COLUMNS = (
@@ -20,14 +34,18 @@ COLUMNS = (
     "began",
     "user",
     "host",
+    "study",
+    "trial",
     "note",
     "id",
 )
 """Columns of a row; `tag.KEY` for each tag follows. `run` is EXPERIMENT/FOLDER, `began` an ISO time, `lap_s`
 the mean usual lap of the best checkpoint, `score_s` its race score (usual and held-out), `exploring_lap_s` the fastest
-exploring lap, all in seconds."""
+exploring lap, all in seconds; of a run in progress, what it has reached so far. `study` and `trial`: of a run that a
+sweep has made, once it has ended."""
 
 Row = dict[str, Any]
+RUNNING, KILLED = "running", "killed"
 
 
 def rows_of_folder(runs_dir: Path) -> list[Row]:
@@ -48,14 +66,68 @@ def _of_folder(folder: Path) -> Row:
     if not summary.get("status"):
         from .folder import is_held  # imports Hydra, which a run that has ended does without
 
-        summary = {"status": "running" if is_held(folder) else "killed"}
+        summary = {"status": RUNNING if is_held(folder) else KILLED}
     row["state"] = str(summary["status"])
+    row |= {key: summary.get(key) for key in ("study", "trial")}
+    if summary["status"] == RUNNING:
+        summary = _so_far(folder)
     best = summary.get("best") or {}
     row |= {"lap_s": best.get("eval_lap_time_s"), "score_s": best.get("eval_race_score_s")}
     row |= {"exploring_laps": summary.get("laps"), "exploring_lap_s": summary.get("best_lap_time_s")}
     row |= {"name": labels.name, "note": labels.note}
     row |= {key: machine.get(key) for key in ("user", "host")}
     return row | labels.named_tags
+
+
+def _so_far(folder: Path) -> dict[str, Any]:
+    """Return what a run in progress has reached, by the keys of a summary: from its metrics and its best checkpoint."""
+    try:
+        rows = read_metrics(folder / METRICS)
+    except BadInput:  # it has only begun
+        return {}
+    name = (folder / CHECKPOINTS / BEST).resolve().name
+    best = next((row for row in rows if f"{row['iteration']:06d}" == name), None)
+    return {**(rows[-1] if rows else {}), "best": best}
+
+
+def fold_studies(rows: Sequence[Row], best_runs: Mapping[str, str]) -> list[Row]:
+    """Return the rows with one for all runs of each study, where the first of them was.
+
+    It has the figures of the study's best run: that of `best_runs`, by the name of the study, or else the run with the
+    best race score.
+    """
+    studies = {row["study"] for row in rows if row["study"] is not None}
+    members: dict[str, list[Row]] = {study: [] for study in studies}
+    folded: list[Row] = []
+    for row in rows:
+        study = row["run"].partition("/")[0]
+        # Only the end of a run says that a sweep has made it.
+        if row["study"] in studies or (study in studies and row["state"] in (RUNNING, KILLED)):
+            of_study = members[row["study"] or study]
+            if not of_study:
+                folded.append(row)
+            of_study.append(row)
+        else:
+            folded.append(row)
+    first = {id(some[0]): _of_study(study, some, best_runs.get(study)) for study, some in members.items()}
+    return [first.get(id(row), row) for row in folded]
+
+
+def _of_study(study: str, rows: Sequence[Row], best_run: str | None) -> Row:
+    def rank(row: Row) -> tuple[bool, float]:
+        score_s = row["score_s"]
+        return row["run"] != f"{study}/{best_run}", math.inf if score_s is None else score_s
+
+    trials = {row["trial"] for row in rows if row["trial"] is not None}
+    number = len(trials) + sum(row["trial"] is None for row in rows)
+    laps = [row["exploring_laps"] for row in rows if row["exploring_laps"] is not None]
+    running = any(row["state"] == RUNNING for row in rows)
+    return min(rows, key=rank) | {
+        "run": f"best:{study}, of {count(number, 'trial')}",
+        "state": RUNNING if running else "ended",
+        "exploring_laps": sum(laps) if laps else None,
+        "began": rows[0]["began"],
+    }
 
 
 def _began_s(folder: Path) -> float:

@@ -8,10 +8,10 @@ from deepracer_exp.runs.labels import USER_TAG
 from deepracer_exp.runs.listing import Row, iso_time
 
 from .calls import pages
-from .metadata import END_TAG, HOST, NAME, USER_NOTE
+from .metadata import END_TAG, HOST, NAME, STUDY, USER_NOTE
 from .metrics import BEST, METRICS
 from .store import open_client
-from .study_run import KIND
+from .study_run import KIND, TRIAL
 
 _ENDED = {"FINISHED": "finished", "FAILED": "failed", "KILLED": "killed", "RUNNING": "running"}
 
@@ -45,6 +45,8 @@ def _of_store(run: Any, experiment: str) -> Row:
         "began": iso_time(run.info.start_time / 1000),
         "user": tags.get("mlflow.user"),
         "host": tags.get(HOST),
+        "study": tags.get(STUDY),
+        "trial": tags.get(TRIAL),
         "note": tags.get(USER_NOTE),
         "id": run.info.run_id,
         **{key: value for key, value in tags.items() if key.startswith(USER_TAG)},

@@ -58,8 +58,72 @@ def test_runs_are_listed_newest_first_with_state_and_results(call, tmp_path):
     ]
 
 
+def write_study(runs_dir: Path) -> None:
+    """Write a study of three trials, one of them running, beside a run of another experiment."""
+    for number, (score_s, ending) in enumerate([(9.0, "finished"), (8.5, "finished"), (None, None)]):
+        best = {"eval_race_score_s": score_s, "eval_lap_time_s": 7.0 + number, "eval_completion": 100.0}
+        summary = {"status": ending, "study": "season", "trial": number, "laps": 10, "best": best}
+        write_run(runs_dir / "season" / f"{stamp(900 - 100 * number)}-{number}", summary if ending else None)
+    write_run(runs_dir / "other" / f"{stamp(1000)}-alone", {"status": "finished"})
+
+
+def test_the_trials_of_a_study_are_one_line_with_its_best_run(call, tmp_path):
+    write_study(tmp_path / "runs")
+    rows = [line.split() for line in call("runs").stdout.splitlines()[1:3]]
+    assert [row[:-2] for row in rows] == [
+        ["best:season,", "of", "3", "trials", "ended", "8.00", "8.50", "20", NONE],
+        [rows[1][0], "finished", NONE, NONE, NONE, NONE],
+    ]
+    # What the sweep calls its best goes before the race score of the training's laps.
+    names = sorted(path.name for path in (tmp_path / "runs" / "season").iterdir())
+    best = {"study": "season", "trial": 0, "run_dir": names[0], "values": {"race_score": 9.1}}
+    (tmp_path / "runs" / "season" / "best_of_sweep.json").write_text(json.dumps(best))
+    assert call("runs").stdout.splitlines()[1].split()[4:7] == ["ended", "7.00", "9.00"]
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--trials"], ["--where", "study=season"], ["--sort", "score_s"], ["--format", "csv"]]
+)
+def test_the_trials_of_a_study_can_be_listed(call, tmp_path, arguments):
+    write_study(tmp_path / "runs")
+    listed = call("runs", "list", *arguments).stdout
+    assert "best:season" not in listed
+    assert sum("season/" in line for line in listed.splitlines()) == 3 - (arguments[0] == "--where")
+
+
+def test_a_running_training_shows_what_its_best_checkpoint_has_reached(call, tmp_path):
+    run = write_run(tmp_path / "runs" / "a" / f"{stamp(90)}-now", None)
+    rows = [
+        {
+            "iteration": 10,
+            "laps": 3,
+            "best_lap_time_s": 9.5,
+            "eval_lap_time_s": 8.25,
+            "eval_race_score_s": 8.75,
+        },
+        {
+            "iteration": 20,
+            "laps": 7,
+            "best_lap_time_s": 9.0,
+            "eval_lap_time_s": 8.0,
+            "eval_race_score_s": 9.5,
+        },
+        {"iteration": 21, "laps": 8, "best_lap_time_s": 8.9},
+    ]
+    (run / "metrics.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows) + '{"iteration": 2')
+    with (run / ".running").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        before = call("runs").stdout.splitlines()[1].split()
+        (run / "checkpoints" / "000010").mkdir(parents=True)
+        (run / "checkpoints" / "best").symlink_to("000010")
+        after = call("runs").stdout.splitlines()[1].split()
+    assert before[1:6] == ["running", NONE, NONE, "8", "8.90"]
+    assert after[1:6] == ["running", "8.25", "8.75", "8", "8.90"]
+
+
 def test_runs_elsewhere_are_listed_with_runs_dir(call, tmp_path):
-    write_run(tmp_path / "there" / "a" / "renamed", {"status": "finished"})
+    run = write_run(tmp_path / "there" / "a" / "renamed", {"status": "finished"})
+    os.utime(run / "config.yaml", (0, 0))
     assert "a/renamed" in call("runs", "runs_dir=there").stdout
     assert call("runs", "list", "runs_dir=there").stdout == call("runs", "runs_dir='there'").stdout
 
