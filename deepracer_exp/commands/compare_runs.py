@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.files import METRICS
+from deepracer_exp.runs.result import TRAINING_LAPS
 
 from .output import print_table, table_console
 from .pages import Item, end_with_page, light, write_comparison_page, write_laps
@@ -23,9 +24,13 @@ if TYPE_CHECKING:
 _RUNS = "Runs"
 _MOST_GROUPS = 12
 """Groups that are shown; of more those with the best race score."""
+_ACHIEVED = (
+    f"Laps, completion and race score are those of the best checkpoint in {TRAINING_LAPS}, which take the most "
+    "probable actions."
+)
 _SCORED = (
-    "Interquartile means over the runs, with 95% intervals: of the evaluation of each run's best checkpoint, which "
-    "takes the most probable actions."
+    f"Interquartile means over the runs, with 95% intervals: of each run's best checkpoint in {TRAINING_LAPS}, which "
+    "take the most probable actions."
 )
 _DIFFERENCES = (
     "The probability of improvement is that a run of the group is better than one of the other on the same track. A "
@@ -182,7 +187,7 @@ def _run_tables(groups: "Sequence[RunGroup]") -> "list[tuple[str, Table, str]]":
         named = list(zip(heads, (str(record.path) for record in records), strict=False))
         achieved = [(name, *texts) for name, texts, _ in results(records[: len(heads)])]
         tables = [
-            ("Results", Table(("", *heads), tuple(achieved), 1), ""),
+            ("Results", Table(("", *heads), tuple(achieved), 1), _ACHIEVED),
             (_RUNS, Table(("", "run"), tuple(named), 2), ""),
         ]
     differences = run_differences(records[: len(heads)]).items()

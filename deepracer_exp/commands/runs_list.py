@@ -172,6 +172,7 @@ def _print_table(rows: "Sequence[Row]") -> None:
     from rich.table import Table
 
     from deepracer_exp.runs.labels import USER_TAG
+    from deepracer_exp.runs.result import TRAINING_LAPS
 
     table = Table("run", "state", box=None, pad_edge=False, header_style="dim")
     table.columns[0].overflow = "fold"
@@ -195,7 +196,14 @@ def _print_table(rows: "Sequence[Row]") -> None:
             _age((now - began).total_seconds()),
             *(str(row.get(key) or "") for key in shown),
         )
-    table_console().print(table)
+    console = table_console()
+    console.print(table)
+    if any(row["lap_s"] is not None for row in rows):
+        console.print(
+            f"lap, race score: of the best checkpoint in {TRAINING_LAPS}; lap: usual, race score: usual and held-out",
+            style="dim",
+            soft_wrap=not console.is_terminal,
+        )
 
 
 def _number(value: Any, form: str) -> str:

@@ -32,7 +32,7 @@ from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.reports.comparison_page import write_comparison
 from deepracer_exp.runs.checkpoint_files import LINKS, kept_checkpoints, pinned
 from deepracer_exp.runs.checkpoints import check, read_policy
-from deepracer_exp.runs.result import BOTH, CRITERIA
+from deepracer_exp.runs.result import BOTH, CRITERIA, of_conditions
 
 logger = logging.getLogger("deepracer_exp")
 
@@ -158,7 +158,8 @@ def recommend(results: Sequence[CheckpointResult], metric: Metric) -> tuple[str,
     if not driven:
         return None
     (best, statistics), *others = sorted(driven, key=lambda pair: pair[1].rank, reverse=True)
-    why = f"best by {CRITERIA[metric]}: {_words(statistics)}"
+    criterion = of_conditions(CRITERIA[metric], math.isfinite(statistics.held_out_completion))
+    why = f"best by {criterion}: {_words(statistics)}"
     if others:
         why += f"; next is {others[0][0].name}: {_words(others[0][1])}"
     for marked, of_marked in driven:
@@ -168,7 +169,7 @@ def recommend(results: Sequence[CheckpointResult], metric: Metric) -> tuple[str,
 
 
 def _words(statistics: LapStatistics) -> str:
-    name = BOTH if math.isfinite(statistics.held_out_completion) else "race score (usual)"
+    name = of_conditions(BOTH, math.isfinite(statistics.held_out_completion))
     score = (
         "no complete lap" if statistics.race_score_s is None else f"{name} {statistics.race_score_s:.2f} s"
     )

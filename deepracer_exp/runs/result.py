@@ -25,6 +25,8 @@ CRITERIA = {
     IN_TRAINING: "exploring laps",
 }
 """Names of the measures; the best of several policies or runs is the one with the highest rank by it."""
+TRAINING_LAPS, SWEEP_LAPS, FRESH_LAPS = "the training's evaluations", "the sweep's laps", "fresh laps"
+"""Names of the laps that a score may be of: a trial of a sweep has scores of all three."""
 FIGURES: tuple[tuple[str, str, str, int], ...] = (
     ("mean usual lap, s", "lap_time_s", "{:.2f}", -1),
     ("usual laps complete, %", "laps_percent", "{:.0f}", 1),
@@ -34,6 +36,11 @@ FIGURES: tuple[tuple[str, str, str, int], ...] = (
 )
 """Figures of an evaluated policy wherever they are shown: name and unit, attribute of RunResult, format, and whether a
 higher value is better (1) or a lower one (-1)."""
+
+
+def of_conditions(name: str, has_held_out: bool) -> str:
+    """Return the name of a measure of both conditions, as it is where there were no laps on the held-out ones."""
+    return name if has_held_out else name.replace("(usual and held-out)", "(usual)")
 
 
 def with_unit(number: str, unit: str) -> str:
@@ -105,7 +112,7 @@ class RunResult:
     @property
     def criterion(self) -> str:
         """Return what its rank goes by, in words."""
-        return CRITERIA.get(self.measure, self.measure)
+        return of_conditions(CRITERIA.get(self.measure, self.measure), self.held_out_completion is not None)
 
     def words(self) -> str:
         """Return the figures that are known: ``mean usual lap 7.97 s, usual completion 100.0%``."""
@@ -126,9 +133,7 @@ class RunResult:
 
     def figure(self, name: str) -> str:
         """Return the name of one of FIGURES; without held-out conditions, the race score is that of the usual ones."""
-        return (
-            name if self.held_out_completion is not None else name.replace("(usual and held-out)", "(usual)")
-        )
+        return of_conditions(name, self.held_out_completion is not None)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,6 +11,7 @@ from deepracer_exp.config.overrides import key_of
 from deepracer_exp.runs.files import BEST_LAP, REPORT, who_and_where
 from deepracer_exp.runs.labels import Labels
 from deepracer_exp.runs.lineage import Lineage
+from deepracer_exp.runs.result import of_conditions
 
 from .metrics import BEST, METRICS, TRACK_METRICS, best_metrics, metric_name, trial_metric
 
@@ -208,7 +209,12 @@ _RACE = {
 def race_result(metrics: Mapping[str, float | None]) -> str:
     """Return an evaluation, by MLflow's names, in words: ``mean usual lap 8.21 s, 99.1% of the lap``."""
     values = {name.rpartition("/")[2]: value for name, value in metrics.items()}
-    parts = [words.format(values[name]) for name, words in _RACE.items() if values.get(name) is not None]
+    has_held_out = values.get("held_out_completion") is not None
+    parts = [
+        of_conditions(words, has_held_out).format(values[name])
+        for name, words in _RACE.items()
+        if values.get(name) is not None
+    ]
     return ", ".join(parts) or "no complete lap"
 
 

@@ -60,7 +60,7 @@ def result(name: str, found: LapStatistics | None, **changes: object) -> Checkpo
         (
             {"000010": figures(95, 9.0), "000020": figures(50, 8.5)},
             "000020",
-            "best by race score (usual and held-out): race score (usual) 8.50 s, usual completion 90.0%, median usual "
+            "best by race score (usual): race score (usual) 8.50 s, usual completion 90.0%, median usual "
             "lap 8.50 s; next is 000010: race score (usual) 9.00 s, usual completion 90.0%, median usual lap 9.00 s",
         ),
         ({"000010": figures(100, 8.5), "000020": figures(90, 8.5)}, "000010", "next is 000020"),

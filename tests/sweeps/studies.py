@@ -76,6 +76,7 @@ def add(
     reason = f"{ending.replace('_', ' ')}: for a reason"
     run = {"seed": 0, "run_dir": str(run_dir), "status": "finished", "ending": ending, "reason": reason}
     run |= {"env_steps": 100_000, "wall_clock_s": 40.0, "lap_time_s": 9.5, "completion": 97.0}
+    run |= {"held_out_completion": 85.0}
     run |= {"values": None if values is None else list(values)}
     run |= {key: attrs.pop(key) for key in RUN_KEYS & attrs.keys()}
     runs = attrs.pop("runs", (SeedRun(**run),))
@@ -98,7 +99,7 @@ def fresh_laps(trial: int, value: float, **more: Any) -> dict[str, Any]:
     """Return what a study stores of a trial's fresh laps."""
     laps = FreshLaps(
         trial=trial, values=[value], interval=[value - 0.5, value + 0.5],
-        lap_time_s=None, completion=50.0, held_out_completion=None,
+        lap_time_s=None, completion=50.0, held_out_completion=40.0,
     )  # fmt: skip
     return asdict(laps) | more
 

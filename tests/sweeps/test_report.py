@@ -97,7 +97,7 @@ def test_the_headline_has_the_steps_of_trials_that_were_pruned_or_failed(tmp_pat
     add(study, None, "collapsed", env_steps=200_000)
     add(study, None, "failed", env_steps=50_000)
     assert study_summary(study) == [
-        "Trial 0 is the best: race score (usual and held-out) 9.50 s.",
+        "Trial 0 is the best: race score (usual and held-out) 9.50 s on the sweep's laps.",
         "3 of 60 trials ended, 1 of them complete; they drove 1.0 M control steps, 25% of them in trials that were "
         "pruned or failed.",
     ]

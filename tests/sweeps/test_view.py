@@ -33,7 +33,16 @@ def shown(claims, is_terminal=True, first=(), after_s=0.0):
 
 
 ENDED = [
-    claim(0, "COMPLETE", [8.25], ending="converged", env_steps=8192, lap_time_s=8.1, completion=98.0),
+    claim(
+        0,
+        "COMPLETE",
+        [8.25],
+        ending="converged",
+        env_steps=8192,
+        lap_time_s=8.1,
+        completion=98.0,
+        held_out_completion=80.0,
+    ),
     claim(1, "PRUNED", None, ending="collapsed", env_steps=4096, reason="collapsed: entropy 0.01"),
 ]
 
@@ -42,7 +51,7 @@ def test_it_counts_trials_by_state_and_names_the_best():
     view = shown([*ENDED, claim(2)])
     for words in (
         "2 of 4: 1 done, 1 pruned, 0 failed",
-        "trial 0, race score (usual and held-out) 8.25 s",
+        "trial 0, race score (usual and held-out) 8.25 s on the sweep's laps",
         "8,192",
         "51%",
     ):
@@ -75,12 +84,17 @@ def test_without_a_terminal_each_trial_that_ends_is_a_line():
     lines = shown(ENDED, is_terminal=False).splitlines()
     assert lines[0] == "spring: 4 trials, 2 workers; runs in runs/spring"
     assert lines[1].startswith(
-        "trial 0 done (converged) after 8,192 steps: race score (usual and held-out) 8.25 s"
+        "trial 0 done (converged) after 8,192 steps: race score (usual and held-out) 8.25 s on the sweep's laps ("
     )
     assert lines[2].startswith(
         "trial 1 pruned (collapsed) after 4,096 steps: collapsed: entropy 0.01; 2 of 4, about"
     )
     assert len(lines) == 3
+
+
+def test_without_held_out_laps_the_race_score_is_that_of_the_usual_ones():
+    ended = claim(0, "COMPLETE", [8.25], completion=98.0)
+    assert "race score (usual) 8.25 s on the sweep's laps" in shown([ended], is_terminal=False)
 
 
 def test_values_keep_their_brackets():

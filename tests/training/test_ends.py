@@ -106,7 +106,10 @@ def test_wherever_a_run_ends_its_last_policy_is_evaluated_and_all_name_the_same_
     assert best["eval_completion"] == last["eval_completion"] is not None
     name = f"{best['iteration']:06d}"
     assert str((ended.folder / "checkpoints" / "best").readlink()) == name
-    assert f"best checkpoint by race score (usual and held-out): {name}, " in ended.stdout
+    assert (
+        f"best checkpoint in the training's evaluations by race score (usual and held-out): {name}, "
+        in ended.stdout
+    )
     assert f"completion {best['eval_completion']:.1f}%" in ended.stdout
     found = findings(prepare(read_run_recording(ended.folder)))
     (submit,) = [one.sentence for one in found if one.rule == "submit"]

@@ -13,6 +13,7 @@ from deepracer_exp.analysis.evidence import Values, difference, estimate
 from deepracer_exp.errors import BadInput
 from deepracer_exp.lookup.best import BestOfSweep, write_best_of_sweep
 from deepracer_exp.runs.files import is_run
+from deepracer_exp.runs.result import FRESH_LAPS, SWEEP_LAPS
 from deepracer_exp.sweeps.search.objectives import MEASURES, NONE, cost, objectives_of, shown, shown_values
 from deepracer_exp.sweeps.trial import SeedRun, Trial
 
@@ -74,9 +75,12 @@ def best_values(study: optuna.Study) -> list[float]:
 
 
 def best_shown(study: optuna.Study) -> str:
-    """Return the values of the best trial as text, with "on fresh laps" if they are from there."""
-    number, values = best_trial(study).number, shown_values(objectives_of(study), best_values(study))
-    return values + " on fresh laps" * any(laps.trial == number for laps in reranked(study))
+    """Return the values of the best trial as text, and on which laps they were driven."""
+    best = best_trial(study)
+    fresh = next((laps for laps in reranked(study) if laps.trial == best.number), None)
+    has_held_out = (fresh or Trial.of(best)).held_out_completion is not None
+    values = shown_values(objectives_of(study), best_values(study), has_held_out)
+    return f"{values} on {SWEEP_LAPS if fresh is None else FRESH_LAPS}"
 
 
 def best_line(study: optuna.Study) -> str:

@@ -16,6 +16,7 @@ from deepracer_exp.lookup.next_steps import COMMAND, command_line
 from deepracer_exp.lookup.next_steps import outcome as run_outcome
 from deepracer_exp.reports.page import plot, render
 from deepracer_exp.runs.files import BEST_LAP, read_config, read_head
+from deepracer_exp.runs.result import FRESH_LAPS, SWEEP_LAPS, TRAINING_LAPS, of_conditions
 from deepracer_exp.sweeps.search.objectives import (
     MEASURES,
     NONE,
@@ -71,9 +72,10 @@ def study_page(study: optuna.Study) -> str:
         best=best_trial(study).number if complete else None,
         winners=_winners(study, objectives, keys),
         seeds=over_seeds(study, keys),
-        objective=MEASURES[objectives[0]].words,
+        objective=of_conditions(MEASURES[objectives[0]].words, _has_held_out(trials)),
         too_few=FEWEST_COMPLETE if len(complete) < FEWEST_COMPLETE else None,
         trials=_table(study, objectives, keys),
+        laps={"training": TRAINING_LAPS, "sweep": SWEEP_LAPS, "fresh": FRESH_LAPS},
         failures=_failures(trials),
         space=study.user_attrs.get("space") or {},
         base=study.user_attrs.get("base") or [],
@@ -179,6 +181,10 @@ def _spent(trials: Sequence[FrozenTrial]) -> int:
     return sum(Trial.of(trial).env_steps for trial in trials)
 
 
+def _has_held_out(trials: Sequence[FrozenTrial]) -> bool:
+    return any(Trial.of(trial).held_out_completion is not None for trial in trials)
+
+
 def _winners(study: optuna.Study, objectives: Sequence[str], keys: dict[str, str]) -> list[dict[str, Any]]:
     """Return the re-ranked trials, the best on fresh laps first."""
     by_number = {trial.number: trial for trial in complete_trials(study)}
@@ -189,8 +195,8 @@ def _winners(study: optuna.Study, objectives: Sequence[str], keys: dict[str, str
         tables.append(
             {
                 "trial": trial.number,
-                "now": shown_values(objectives, laps.values),
-                "before": shown_values(objectives, trial.values),
+                "now": shown_values(objectives, laps.values, laps.held_out_completion is not None),
+                "before": shown_values(objectives, trial.values, laps.held_out_completion is not None),
                 "interval": " to ".join(shown(objectives[0], end) for end in laps.interval),
                 "lap_time": shown_or_dash("lap_time", laps.lap_time_s),
                 "completion": shown_or_dash("completion", laps.completion),
@@ -232,10 +238,12 @@ def _table(study: optuna.Study, objectives: Sequence[str], keys: dict[str, str])
                 "reason": reason if len(reason) <= _LONGEST_REASON else f"{reason[: _LONGEST_REASON - 1]}…",
             }
         )
+    names = (*objectives, *dict(extra).values())
+    titles = [of_conditions(MEASURES[name].title, _has_held_out(trials)) for name in names]
     return {
         "rows": rows,
         "left_out": max(0, len(order) - _MOST_ROWS),
-        "measures": [*(MEASURES[name].title for name in (*objectives, *dict(extra).values())), "Held-out"],
+        "measures": [*titles, "Held-out completion"],
         "parameters": [(keys[key], key) for key in columns],
         "more_parameters": len(keys) - len(columns),
     }
@@ -270,8 +278,10 @@ def _failures(trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
 
 def _facts(study: optuna.Study, objectives: Sequence[str]) -> list[tuple[str, str]]:
     attrs = study.user_attrs
+    has_held_out = _has_held_out(study.get_trials(deepcopy=False))
+    words = [of_conditions(MEASURES[name].words, has_held_out) for name in objectives]
     facts = [
-        ("Objective" + "s" * (len(objectives) > 1), ", ".join(MEASURES[name].words for name in objectives)),
+        ("Objective" + "s" * (len(objectives) > 1), ", ".join(words)),
         ("Evaluation", str(attrs.get("protocol", NONE))),
         ("Seeds of a trial", str(attrs.get("seeds", 1))),
         ("Runs", f"{attrs.get('runs_dir', 'runs')}/{study.study_name}"),

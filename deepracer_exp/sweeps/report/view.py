@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from deepracer_exp.errors import count
+from deepracer_exp.runs.result import SWEEP_LAPS
 from deepracer_exp.sweeps.queue.claims import Claim
 from deepracer_exp.sweeps.queue.worker_config import WorkerConfig
 from deepracer_exp.sweeps.search.objectives import NONE, cost, shown_values
@@ -158,7 +159,8 @@ def _best(claims: Sequence[Claim], objectives: Sequence[str]) -> str:
 
 def _values(trial: Trial, objectives: Sequence[str]) -> str:
     lap = "no lap" if trial.lap_time_s is None else f"mean usual lap {trial.lap_time_s:.2f} s"
-    return f"{shown_values(objectives, trial.values or ())} ({lap}, {trial.completion:.0f}% driven)"
+    values = shown_values(objectives, trial.values or (), trial.held_out_completion is not None)
+    return f"{values} on {SWEEP_LAPS} ({lap}, {trial.completion:.0f}% driven)"
 
 
 def _sentence(claim: Claim, objectives: Sequence[str]) -> str:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import optuna
 
 from deepracer_exp.errors import BadInput
-from deepracer_exp.runs.result import with_unit
+from deepracer_exp.runs.result import of_conditions, with_unit
 
 if TYPE_CHECKING:
     from deepracer_exp.evaluation.result import Evaluation
@@ -144,7 +144,9 @@ def shown_or_dash(objective: str, value: float | None) -> str:
     return NONE if value is None else shown(objective, value)
 
 
-def shown_values(objectives: Sequence[str], values: Sequence[float]) -> str:
-    """Return all values of a trial: ``lap time 9.84 s, completion 97.3%``."""
+def shown_values(objectives: Sequence[str], values: Sequence[float], has_held_out: bool) -> str:
+    """Return all values of a trial: ``lap time 9.84 s, completion 97.3%``; `has_held_out`: it drove held-out laps."""
     pairs = zip(objectives, values, strict=True)
-    return ", ".join(f"{MEASURES[name].words} {shown(name, value)}" for name, value in pairs)
+    return ", ".join(
+        f"{of_conditions(MEASURES[name].words, has_held_out)} {shown(name, value)}" for name, value in pairs
+    )
