@@ -5,7 +5,7 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from deepracer_exp.errors import BadInput, writing
+from deepracer_exp.errors import BadInput, count, writing
 
 from .arguments import add_command, add_overrides, is_override
 from .evaluate import choose_graphics
@@ -178,7 +178,7 @@ def experiment_on(overrides: list[str]) -> "tuple[Experiment, Track]":
 
 
 def search_fastest(experiment: "Experiment", track: "Track") -> "FastestLap":
-    """Return the fastest lap; a search shows how far it is.
+    """Return the fastest lap; a search prints on standard error what it searches, and how far it is.
 
     Raises:
         BadInput: as for `Question.of`.
@@ -187,18 +187,32 @@ def search_fastest(experiment: "Experiment", track: "Track") -> "FastestLap":
     from rich.progress import Progress, TimeRemainingColumn
 
     from deepracer_exp.fastest.lap import Question, fastest_lap, kept_lap
+    from deepracer_exp.fastest.search import PASSES
 
     question = Question.of(experiment, track)
     kept = kept_lap(question)
     if kept is not None:
         return kept
+    console, rounds = plain_console(stderr=True), count(len(PASSES), "round")
+    # Where numba keeps what it has compiled.
+    if not any(Path(__file__).parents[1].glob("fastest/__pycache__/optimal_control.*.nbi")):
+        rounds += "; the search is compiled first, once after an installation (about a minute)"
+    console.print(
+        f"searching the fastest lap of {experiment.car.name} on {track.title} in {rounds}", soft_wrap=True
+    )
     columns = (*Progress.get_default_columns()[:3], TimeRemainingColumn())
-    with Progress(*columns, console=plain_console(stderr=True), transient=True) as progress:
+    shown = 0
+    with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task("fastest lap", total=1.0)
 
         def show(share: float, lap_time_s: float | None) -> None:
-            so_far = "fastest lap" if lap_time_s is None else f"fastest lap, {lap_time_s:.3f} s so far"
-            progress.update(task, completed=share, description=so_far)
+            nonlocal shown
+            so_far = "no lap yet" if lap_time_s is None else f"{lap_time_s:.3f} s so far"
+            progress.update(task, completed=share, description=f"fastest lap, {so_far}")
+            # Without a terminal there is no bar.
+            if not console.is_terminal and int(10 * share) > shown:
+                shown = int(10 * share)
+                console.print(f"  {share:.0%}: {so_far}")
 
         return fastest_lap(question, show)
 

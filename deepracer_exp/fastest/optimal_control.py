@@ -206,8 +206,11 @@ def _backward(  # type: ignore[no-untyped-def]
             step[n] = change
             gain[n] = K
             slope = q_x + K.T @ (q_uu @ change) + K.T @ q_u + q_ux.T @ change
-            bend = q_xx + K.T @ q_uu @ K + K.T @ q_ux + q_ux.T @ K
-            bend = 0.5 * (bend + bend.T)
+            both_ways = q_xx + K.T @ q_uu @ K + K.T @ q_ux + q_ux.T @ K
+            # The sum with its transpose has no order in memory that products are fast with.
+            for k in range(size):
+                for j in range(size):
+                    bend[k, j] = 0.5 * (both_ways[k, j] + both_ways[j, k])
         if 0 < n < periods + closed:
             # States, too, are to stay near those that the derivatives were taken at, across the heading above all.
             cos, sin = math.cos(states[n, 2]), math.sin(states[n, 2])

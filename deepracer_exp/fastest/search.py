@@ -55,7 +55,7 @@ class _Pass(NamedTuple):
     """Speeds along each line where there is no plan yet."""
 
 
-_PASSES = (_Pass(10, (1.8, 2.6)), _Pass(7, (2.0, 3.0)), _Pass(8, (2.0, 3.0)))
+PASSES = (_Pass(10, (1.8, 2.6)), _Pass(7, (2.0, 3.0)), _Pass(8, (2.0, 3.0)))
 """They differ so that they end in different laps."""
 
 
@@ -94,13 +94,13 @@ class Search:
             RunFailed: no lap is possible within the limits.
         """
         best: _Plan | None = None
-        for number, how in enumerate(_PASSES):
+        for number, how in enumerate(PASSES):
             best_s = None if best is None else lap_time_s(len(best.commands), self._car)
             ways = lines if best is None else (*lines, self._line(best.commands))
             guesses = list(product([evenly(way, _APART_M)[0] for way in ways], how.guessed_mps))
 
             def progressed(share: float, number: int = number, best_s: float | None = best_s) -> None:
-                on_round((number + share) / len(_PASSES), best_s)
+                on_round((number + share) / len(PASSES), best_s)
 
             commands = self._window_by_window(guesses, how.driven, progressed)
             if commands is None:

@@ -472,7 +472,7 @@ def test_a_run_of_ours_is_advised_to_take_a_checkpoint_that_it_has() -> None:
     fell_back = [*LEARNED, 0.4, 0.4, 0.4]
     for completions, words in (
         (LEARNED, "checkpoint 000010, the best, whose evaluation completed 90%"),
-        (fell_back, "take checkpoint 000010 (the best by race score (usual and held-out))"),
+        (fell_back, "take checkpoint 000010 (the best by race score (usual))"),
     ):
         view = training(completions, evaluated=FALLING)
         assert "000010" not in findings(view)[0].sentence

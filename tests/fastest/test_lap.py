@@ -1,13 +1,18 @@
 import json
+import warnings
 
 import numpy as np
 import pytest
 
+from deepracer_exp.commands.tracks import search_fastest
+from deepracer_exp.compiled import njit
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.rules import lap_clock_s
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.fastest import lap as fastest
 from deepracer_exp.fastest.lap import FastestLap, Question, fastest_lap, kept_lap
+from deepracer_exp.fastest.optimal_control import _backward
+from deepracer_exp.fastest.search import Search
 from deepracer_exp.tracks.track import Track
 
 FAST = ("action_space=continuous", "action_space.speed.low=0.1", "action_space.speed.high=4")
@@ -138,3 +143,36 @@ def test_limits_that_no_lap_fits_into_are_said_in_one_line(cache):
 def test_a_command_that_cannot_be_chosen_is_refused():
     with pytest.raises(BadInput, match="speed is always 2"):
         question("action_space.speed.low=2", "action_space.speed.high=2")
+
+
+def test_without_a_terminal_a_search_prints_what_it_searches_and_each_tenth(
+    lap, capsys, monkeypatch, tmp_path
+):
+    def answer(_, on_round):
+        for share, lap_time_s in ((0.01, None), (0.11, None), (0.15, None), (0.52, 2.5), (1.0, 2.25)):
+            on_round(share, lap_time_s)
+        return lap
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(Question, "answer", answer)
+    search_fastest(compose_experiment(FAST)[0], ring())
+    first, *lines = capsys.readouterr().err.splitlines()
+    assert first.startswith("searching the fastest lap of deepracer on ring in 3 rounds")
+    assert [line.strip() for line in lines if line.strip()] == [
+        "11%: no lap yet",
+        "52%: 2.500 s so far",
+        "100%: 2.250 s so far",
+    ]
+
+
+def test_the_search_is_compiled_without_a_warning():
+    asked, periods = question(), 2
+    search = Search(asked.experiment.car, asked.track, np.array([0.1, -0.5]), np.array([4.0, 0.5]))
+    states, commands = np.zeros((periods + 1, 15)), np.zeros((periods, 2))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        njit(_backward.py_func)(
+            search._problem(0.0), states, commands, np.array([[0.1, -0.5], [4.0, 0.5]]), np.zeros(periods + 1),
+            100.0, np.ones(2), 1.0, np.zeros((periods, 15, 15)), np.zeros((periods, 15, 2)),
+            np.zeros((periods, 2)), np.zeros((periods, 2, 15)),
+        )  # fmt: skip

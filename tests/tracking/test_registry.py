@@ -62,7 +62,7 @@ def test_a_promoted_version_has_metrics_signature_report_and_description(season,
     season.promote(run)
     version = client.get_model_version_by_alias("season", "champion")
     assert version.description.startswith(
-        "Checkpoint 20 of `season/1`: mean usual lap 9.88 s, 98.8% of the lap, race score (usual and held-out) 9.50 s."
+        "Checkpoint 20 of `season/1`: mean usual lap 9.88 s, 98.8% of the lap, race score (usual) 9.50 s."
     )
     logged = client.get_logged_model(model_id(version))
     metrics = {metric.key: metric.value for metric in logged.metrics}
