@@ -85,7 +85,7 @@ def sentences(groups: Sequence[RunGroup], comparisons: Sequence[Comparison]) -> 
         if comparison.figure in VERDICT and (comparison.course is None or alone):
             verdicts.setdefault(comparison.group, []).append(comparison)
     lines = [
-        f"{name} against {groups[0].name}: {'; '.join(one.words for one in some)}."
+        f"{name} against {groups[0].name}: {'; '.join(comparison.words for comparison in some)}."
         + " Too few runs to tell this from chance." * (not single and not some[0].difference.enough)
         for name, some in verdicts.items()
     ]
