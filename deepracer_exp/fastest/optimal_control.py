@@ -198,7 +198,8 @@ def _backward(  # type: ignore[no-untyped-def]
             _limited(q_uu, q_u, limits[0] - commands[n], limits[1] - commands[n], change, free)
             K = np.zeros((2, size))
             if free[0] and free[1]:
-                K = -np.linalg.solve(q_uu, q_ux)
+                # Into its place: `solve` returns columns first, and numba warns of products of either order.
+                K[:] = -np.linalg.solve(q_uu, q_ux)
             elif free[0]:
                 K[0] = -q_ux[0] / q_uu[0, 0]
             elif free[1]:
@@ -206,11 +207,8 @@ def _backward(  # type: ignore[no-untyped-def]
             step[n] = change
             gain[n] = K
             slope = q_x + K.T @ (q_uu @ change) + K.T @ q_u + q_ux.T @ change
-            both_ways = q_xx + K.T @ q_uu @ K + K.T @ q_ux + q_ux.T @ K
-            # The sum with its transpose has no order in memory that products are fast with.
-            for k in range(size):
-                for j in range(size):
-                    bend[k, j] = 0.5 * (both_ways[k, j] + both_ways[j, k])
+            bend = q_xx + K.T @ q_uu @ K + K.T @ q_ux + q_ux.T @ K
+            bend = 0.5 * (bend + bend.T)
         if 0 < n < periods + closed:
             # States, too, are to stay near those that the derivatives were taken at, across the heading above all.
             cos, sin = math.cos(states[n, 2]), math.sin(states[n, 2])
