@@ -202,14 +202,14 @@ def search_fastest(experiment: "Experiment", track: "Track") -> "FastestLap":
     )
     columns = (*Progress.get_default_columns()[:3], TimeRemainingColumn())
     shown = 0
-    with Progress(*columns, console=console, transient=True) as progress:
+    # Without a terminal there is no bar, and each tenth is a line.
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("fastest lap", total=1.0)
 
         def show(share: float, lap_time_s: float | None) -> None:
             nonlocal shown
             so_far = "no lap yet" if lap_time_s is None else f"{lap_time_s:.3f} s so far"
             progress.update(task, completed=share, description=f"fastest lap, {so_far}")
-            # Without a terminal there is no bar.
             if not console.is_terminal and int(10 * share) > shown:
                 shown = int(10 * share)
                 console.print(f"  {share:.0%}: {so_far}")

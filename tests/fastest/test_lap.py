@@ -157,12 +157,8 @@ def test_without_a_terminal_a_search_prints_what_it_searches_and_each_tenth(
     monkeypatch.setattr(Question, "answer", answer)
     search_fastest(compose_experiment(FAST)[0], ring())
     first, *lines = capsys.readouterr().err.splitlines()
-    assert first.startswith("searching the fastest lap of deepracer on ring in 3 rounds")
-    assert [line.strip() for line in lines if line.strip()] == [
-        "11%: no lap yet",
-        "52%: 2.500 s so far",
-        "100%: 2.250 s so far",
-    ]
+    assert first.startswith("searching the fastest lap of deepracer_v6 on ring in 3 rounds")
+    assert lines == ["  11%: no lap yet", "  52%: 2.500 s so far", "  100%: 2.250 s so far"]
 
 
 def test_the_search_is_compiled_without_a_warning():
