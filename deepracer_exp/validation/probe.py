@@ -1,8 +1,9 @@
 """Call a reward function in one situation after another, recording rewards, failures and executed lines."""
 
 import ast
+import operator
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import chain
 from types import FrameType
@@ -15,7 +16,7 @@ from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.rewards.guard import Guard, Misconduct
 from deepracer_exp.rewards.reward import RewardFailed, RewardFunction
 
-from .situations import Situations, start
+from .situations import FIRST_STEP, Situations, start
 
 NOT_CALLED = "not called"
 """The failure of a call that was skipped because an earlier one hung."""
@@ -46,13 +47,18 @@ class Probe:
         BadInput: the module cannot be loaded.
     """
 
-    def __init__(self, setup: RaceSetup):
-        """Load the module of a race and call it at the start, where functions with a memory set themselves up."""
+    def __init__(self, setup: RaceSetup, first_step: int = FIRST_STEP):
+        """Load the module of a race and call it at the start, where functions with a memory set themselves up.
+
+        `first_step` is the `steps` of that call.
+        """
         self._function = RewardFunction(setup.reward, 1, setup.reward_time_limit_s, None, scalar=True)
         self.hangs = False
         self.without_line: set[str] = set()
         self._forget()
-        self.start = self.call(next(start(setup).params()))
+        first = start(setup)
+        steps = np.full_like(first.columns["steps"], first_step)
+        self.start = self.call(next(first.with_columns(steps=steps).params()))
         self._forget()
 
     def _forget(self) -> None:
@@ -159,6 +165,51 @@ def never_executed(text: str, lines: set[int]) -> list[tuple[int, int]]:
         else:
             missed.append((first, last))
     return missed
+
+
+_COMPARISONS: dict[type[ast.cmpop], Callable[[float, float], bool]] = {
+    ast.Eq: operator.eq,
+    ast.NotEq: operator.ne,
+    ast.Lt: operator.lt,
+    ast.LtE: operator.le,
+    ast.Gt: operator.gt,
+    ast.GtE: operator.ge,
+}
+
+
+def lines_for_step_1(text: str) -> set[int]:
+    """Return the first lines of the branches that are taken only where the param `steps` is 1."""
+    tree = ast.parse(text)
+    names = {
+        target.id
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Assign) and _reads_steps(node.value)
+        for target in node.targets
+        if isinstance(target, ast.Name)
+    }
+    lines = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If):
+            for compare in ast.walk(node.test):
+                at_1, later = (_holds(compare, names, steps) for steps in (1, FIRST_STEP))
+                if at_1 != later:
+                    lines |= {branch[0].lineno for branch in [node.body if at_1 else node.orelse] if branch}
+    return lines
+
+
+def _reads_steps(node: ast.expr) -> bool:
+    return any(isinstance(part, ast.Constant) and part.value == "steps" for part in ast.walk(node))
+
+
+def _holds(node: ast.AST, names: set[str], steps: int) -> bool | None:
+    """Return whether a comparison of `steps`, or of one of these names, with a number holds; None: it is none."""
+    match node:
+        case ast.Compare(left=left, ops=[op], comparators=[ast.Constant(value=int() | float() as limit)]):
+            if type(op) in _COMPARISONS and (
+                left.id in names if isinstance(left, ast.Name) else _reads_steps(left)
+            ):
+                return _COMPARISONS[type(op)](steps, limit)
+    return None
 
 
 def _missed(body: list[ast.stmt], lines: set[int]) -> Iterator[tuple[int, int]]:

@@ -20,6 +20,9 @@ from .objects import QUIRKS, Quirks, all_at, first_placement, object_columns
 
 Floats = NDArray[np.float64]
 
+FIRST_STEP = 2
+"""`steps` of the first call of an episode, on the service since 2020: its first step, the prepare step, has no call."""
+
 
 @dataclass(frozen=True, eq=False)
 class Situations:
@@ -93,8 +96,7 @@ def poses(
         heading_error_rad=error_rad,
         speed_mps=speed,
         steering_deg=steering,
-        # The first step is the prepare step; the function is called from the second on.
-        steps=2 + steps.astype(np.int64),
+        steps=FIRST_STEP + steps.astype(np.int64),
         progress_before=100.0 * ndist_,
     )
 

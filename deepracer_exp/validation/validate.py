@@ -32,9 +32,10 @@ from .aws_rules import AwsFinding, text_findings
 from .laps import action_space_laps
 from .objects import with_others
 from .pitfalls import LapReturn
-from .probe import NOT_CALLED, Answer, Coverage, Probe, never_executed
+from .probe import NOT_CALLED, Answer, Coverage, Probe, lines_for_step_1, never_executed
 from .reward_map import RewardGrid, State, draw_reward_map, sample_reward_grid, state_of
 from .situations import (
+    FIRST_STEP,
     NamedSituation,
     Situations,
     named_situations,
@@ -56,6 +57,7 @@ _DETAILS = ((0.3e-3, 1.0), (3e-3, 0.5), (30e-3, 0.25))
 """Resolution of the map by CPU seconds per call."""
 _CARS = 128
 """Default cars of a process."""
+_FIRST_CALL = f"steps is {FIRST_STEP} in the first call of an episode"
 _SLOW_S = 1e-3
 """CPU seconds per call; with a fast reward, a step of these cars takes about 2 ms (`benchmarks.throughput`)."""
 
@@ -170,9 +172,21 @@ def try_named_situations(check: Check) -> None:
         failed_with = next((params for _, params in probe.failures), None)
         check.tried[case.name] = _with_its_line(setup, probe, answer, failed_with)
     failed = {answer.failure for answer in check.tried.values()} - {None, NOT_CALLED}
+    from_1 = _failures_from_step_1(check) if failed and not hangs else set(map(str, failed))
     for what in sorted(map(str, failed)):
         names = [name for name, answer in check.tried.items() if answer.failure == what]
-        check.failures.append(f"{what}, at {', '.join(names)}")
+        # Without the line that may precede it.
+        fails_anyway = any(map(what.endswith, from_1))
+        why = "" if fails_anyway else f"waits for steps == 1, and {_FIRST_CALL}: "
+        check.failures.append(f"{why}{what}, at {', '.join(names)}")
+
+
+def _failures_from_step_1(check: Check) -> set[str]:
+    """Return what fails in the named situations if `steps` is 1 in the first call of an episode."""
+    setup = check.setup
+    cases = named_situations(setup, check.against)
+    answers = [Probe(setup, 1).start, *(_act(Probe(case.setup, 1), case) for case in cases)]
+    return {answer.failure for answer in answers if answer.failure is not None}
 
 
 def _act(probe: Probe, case: NamedSituation) -> Answer:
@@ -304,9 +318,11 @@ def _failures(setup: RaceSetup, probe: Probe) -> list[str]:
 def _unreached(text: str, lines: set[int], of: int) -> list[str]:
     written = text.split("\n")
     warnings = []
+    at_step_1 = lines_for_step_1(text)
     for first, last in never_executed(text, lines):
         place = f"line {first}" if first == last else f"lines {first} to {last}"
-        warnings.append(f"never reaches {place} in {of:,} situations: {written[first - 1].strip()}")
+        why = "" if at_step_1.isdisjoint(range(first, last + 1)) else f"; {_FIRST_CALL}"
+        warnings.append(f"never reaches {place} in {of:,} situations: {written[first - 1].strip()}{why}")
     return warnings
 
 

@@ -4,7 +4,7 @@ import pytest
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.validation import validate as checking
-from deepracer_exp.validation.probe import NOT_CALLED, Probe
+from deepracer_exp.validation.probe import NOT_CALLED, Probe, lines_for_step_1
 from deepracer_exp.validation.reward_map import state_of
 
 
@@ -195,6 +195,64 @@ def test_a_function_that_sets_its_state_up_at_the_start_of_an_episode_can_be_use
     assert check.failures == []
     assert check.state == "earlier calls"
     assert all(answer.failure is None for answer in check.tried.values())
+
+
+WAITS_FOR_STEP_1 = """\
+first = None
+def reward_function(params):
+    global first
+    here = params["progress"]
+    if {test}:
+        first = here
+    return {value}
+"""
+NO_STEP_1 = "steps is 2 in the first call of an episode"
+
+
+@pytest.mark.parametrize(
+    "test", ['params["steps"] == 1', 'params.get("steps") <= 1', 'int(params["steps"]) < 2']
+)
+def test_a_function_that_fails_because_it_waits_for_step_1_is_refused_with_that_reason(check_of, test):
+    """The service's first step, the prepare step, has no call."""
+    (failure,) = check_of(WAITS_FOR_STEP_1.format(test=test, value="here - first")).failures
+    assert failure.startswith(f"waits for steps == 1, and {NO_STEP_1}: raised TypeError")
+
+
+def test_a_function_that_fails_whatever_its_first_step_is_gets_no_such_reason(check_of):
+    (failure,) = check_of(WAITS_FOR_STEP_1.format(test='params["steps"] == 0', value="here - first")).failures
+    assert "in the first call" not in failure
+
+
+@pytest.mark.parametrize(
+    ("test", "warned"),
+    [
+        ('params["steps"] == 1', True),
+        ('(steps := params["steps"]) and not steps', False),
+        ('params["speed"] == 1.5', False),
+        ('params["steps"] <= 2', False),
+    ],
+)
+def test_a_branch_for_step_1_that_is_never_reached_is_said_to_be_that(check_of, test, warned):
+    check = check_of(WAITS_FOR_STEP_1.format(test=test, value='here - params["speed"]'))
+    assert check.failures == []
+    assert (
+        any("never reaches line 6" in line and line.endswith(NO_STEP_1) for line in check.warnings) == warned
+    )
+
+
+def test_what_is_set_aside_for_step_1_by_name_or_in_an_else_is_known():
+    text = """\
+steps = params["steps"]
+if steps == 1:
+    a = 1
+if steps > 1:
+    b = 1
+else:
+    c = 1
+if speed == 1 or steps == 2:
+    d = 1
+"""
+    assert lines_for_step_1(text) == {3, 7}
 
 
 def test_a_first_call_that_computes_long_does_not_shrink_the_sample(race_with):
