@@ -1,6 +1,7 @@
-"""Laps of one line at several shares of its speeds, driven in the simulated car by a simple driver."""
+"""Laps driven in the simulated car by a simple driver: of one line at several shares of its speeds, and flawed ones."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from deepracer_exp.env.state import Measures
 from deepracer_exp.env.trace import STATUS_CODE
 from deepracer_exp.rewards.params import BATCH_COLUMNS, MASK, OBJECT_COLUMNS
 from deepracer_exp.sim.batch import CarBatch
+from deepracer_exp.tracks.track import Track
 
 from .objects import free_road
 from .situations import Situations
@@ -29,12 +31,33 @@ _AHEAD_M, _AHEAD_S = 0.45, 0.2
 _UNDERSTEER = 1.5
 _BRAKING_MPS2 = 0.7
 _LOOK_M = np.linspace(0.0, 2.4, 9)
+_BEND_M, _BEND_RAD = 0.6, 0.4
+"""What is a bend to a driver on the outside of it: the road turns by about so much within this distance of a place."""
+_WEAVE_S = 0.27
+"""Time for which a driver that weaves steers to one side; about that of a car's steering."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Driver:
+    """How a lap is driven."""
+
+    lateral_mps2: float
+    """Lateral acceleration in bends."""
+    share: float = 1.0
+    """Factor on the speed at each place."""
+    weave_deg: float = 0.0
+    """Added to the steering angle, to the left and to the right in turn."""
+    outwards: float = 0.0
+    """How far towards the outer border of each bend: 0 is the centre line, 1 the border."""
+    foresight: float = 1.0
+    """Share of the distance ahead in which bends are seen; 0: one brakes in them."""
 
 
 @dataclass(frozen=True, eq=False)
 class DrivenLap:
     """A complete lap with all wheels on the track."""
 
+    driver: Driver
     speed_mps: float
     """Commanded on straights; less in bends."""
     time_s: float
@@ -50,7 +73,9 @@ def action_space_laps(setup: RaceSetup) -> list[DrivenLap]:
     shares = [share for share in SHARES if share * setup.actions.high[1] > setup.actions.low[1]]
     shares = [*shares[:-1], 1.0]
     best: list[DrivenLap] = []
-    laps = drive_laps(setup, np.repeat(_LATERAL_MPS2, len(shares)), np.tile(shares, len(_LATERAL_MPS2)))
+    laps = drive_laps(
+        setup, [Driver(lateral_mps2=bend, share=share) for bend in _LATERAL_MPS2 for share in shares]
+    )
     for first in range(0, len(laps), len(shares)):
         complete = [lap for lap in laps[first : first + len(shares)] if lap is not None]
         if len(complete) > len(best):
@@ -58,17 +83,44 @@ def action_space_laps(setup: RaceSetup) -> list[DrivenLap]:
     return best
 
 
-def drive_laps(setup: RaceSetup, lateral_mps2: Floats, share: Floats) -> list[DrivenLap | None]:
-    """Drive n laps side by side by pursuit of the centre line; None: not completed with all wheels on the track.
+def flawed_laps(setup: RaceSetup, good: DrivenLap) -> dict[str, DrivenLap]:
+    """Return laps like a good one but no faster, each with a flaw by which it is named.
+
+    The flaw is as strong as the car stays on the road with all wheels; where it does not stay there with the least of
+    it, the lap is missing.
+    """
+
+    def laps(bends: Sequence[float], **flaw: float) -> list[Driver]:
+        return [replace(good.driver, lateral_mps2=bend * good.driver.lateral_mps2, **flaw) for bend in bends]
+
+    flaws = {
+        "zig-zag": [driver for deg in (20.0, 14.0, 8.0) for driver in laps([1.0, 0.8], weave_deg=deg)],
+        "wide": [driver for share in (0.6, 0.4) for driver in laps([1.0, 0.8, 0.6], outwards=share)],
+        # Who brakes late has to take the bend slower.
+        "late braking": [
+            driver for seen in (0.0, 0.3) for driver in laps([0.7, 0.5, 0.3, 0.15], foresight=seen)
+        ],
+    }
+    driven = iter(drive_laps(setup, [driver for drivers in flaws.values() for driver in drivers]))
+    found: dict[str, DrivenLap] = {}
+    for name, drivers in flaws.items():
+        for lap in [next(driven) for _ in drivers]:
+            if lap is not None and lap.time_s >= good.time_s:
+                found.setdefault(name, lap)
+    return found
+
+
+def drive_laps(setup: RaceSetup, drivers: Sequence[Driver]) -> list[DrivenLap | None]:
+    """Drive laps side by side by pursuit of the centre line; None: not completed with all wheels on the track.
 
     In a race among others these are always half a lap away.
 
     Args:
         setup: the track, the car, and the action space with the highest speed and the lowest, which holds in bends.
-        lateral_mps2: lateral acceleration in bends, (n,).
-        share: factor on the speed at each place, (n,).
+        drivers: one for each lap.
     """
-    n = len(share)
+    n = len(drivers)
+    share = np.array([driver.share for driver in drivers])
     car = setup.car
     lowest_mps, highest_mps = float(setup.actions.low[1]), float(setup.actions.high[1])
     batch = CarBatch(car, n, 1, setup.track.floor.friction)
@@ -84,8 +136,8 @@ def drive_laps(setup: RaceSetup, lateral_mps2: Floats, share: Floats) -> list[Dr
     while driving.any() and len(steps) < most:
         now = rules.measure(batch.read())
         result = rules.apply()
-        steering_deg = _steer(setup, now)
-        wanted_mps = share * np.minimum(_bend_speed(setup, now, lateral_mps2), highest_mps)
+        steering_deg = _steer(setup, now, drivers, len(steps) * car.control_period_s)
+        wanted_mps = share * np.minimum(_bend_speed(setup, now, drivers), highest_mps)
         wanted_mps = np.maximum(wanted_mps, lowest_mps)
         steps.append(rules.params(result, steering_deg, wanted_mps))
         if others is not None:
@@ -100,6 +152,7 @@ def drive_laps(setup: RaceSetup, lateral_mps2: Floats, share: Floats) -> list[Dr
     columns = {key: np.stack([step[key] for step in steps]) for key in keys}
     return [
         DrivenLap(
+            driver=drivers[i],
             speed_mps=float(max(share[i] * highest_mps, lowest_mps)),
             time_s=float(lap_clock_s(ends[i], car.control_period_s)),
             paid=Situations(
@@ -112,20 +165,27 @@ def drive_laps(setup: RaceSetup, lateral_mps2: Floats, share: Floats) -> list[Dr
     ]
 
 
-def _bend_speed(setup: RaceSetup, now: Measures, lateral_mps2: Floats) -> Floats:
-    """Return the highest speed from which a car can still brake for every bend ahead, (n,)."""
+def _bend_speed(setup: RaceSetup, now: Measures, drivers: Sequence[Driver]) -> Floats:
+    """Return the highest speed from which a car can still brake for every bend that its driver sees ahead, (n,)."""
     track = setup.track
-    place = now.ndist[:, None] + _LOOK_M / track.length_m
+    lateral_mps2 = np.array([driver.lateral_mps2 for driver in drivers])
+    look_m = _LOOK_M * np.array([driver.foresight for driver in drivers])[:, None]
+    place = now.ndist[:, None] + look_m / track.length_m
     around_m = 0.25
-    behind, ahead = (track.start_pose(place + side * around_m / track.length_m).yaw_rad for side in (-1, 1))
-    turn_rad = np.abs(np.mod(ahead - behind + np.pi, 2 * np.pi) - np.pi)
-    curvature = np.maximum(turn_rad / (2 * around_m), 1e-3)
-    braking_m = np.maximum(_LOOK_M - 0.3, 0.0)
+    curvature = np.maximum(np.abs(_turn_rad(track, place, around_m)) / (2 * around_m), 1e-3)
+    braking_m = np.maximum(look_m - 0.3, 0.0)
     fastest: Floats = np.sqrt(lateral_mps2[:, None] / curvature + 2 * _BRAKING_MPS2 * braking_m).min(axis=1)
     return fastest
 
 
-def _steer(setup: RaceSetup, now: Measures) -> Floats:
+def _turn_rad(track: Track, ndist: Floats, around_m: float) -> Floats:
+    """Return by how much the centre line turns to the left from so far behind a place to so far ahead of it."""
+    behind, ahead = (track.start_pose(ndist + side * around_m / track.length_m).yaw_rad for side in (-1, 1))
+    turn_rad: Floats = np.mod(ahead - behind + np.pi, 2 * np.pi) - np.pi
+    return turn_rad
+
+
+def _steer(setup: RaceSetup, now: Measures, drivers: Sequence[Driver], time_s: float) -> Floats:
     """Return pure-pursuit steering angles in degrees, from the predicted pose to a point ahead, (n,)."""
     car, track = setup.car, setup.track
     speed_mps = np.maximum(now.speed_mps, 0.3)
@@ -134,9 +194,16 @@ def _steer(setup: RaceSetup, now: Measures) -> Floats:
     x_m = now.x_m + speed_mps * _FORESIGHT_S * np.cos(direction_rad)
     y_m = now.y_m + speed_mps * _FORESIGHT_S * np.sin(direction_rad)
     ndist = track.project(np.column_stack([x_m, y_m])).ndist
-    target = track.points_at(ndist + (_AHEAD_M + _AHEAD_S * speed_mps) / track.length_m)
-    dx, dy = target[:, 0] - x_m, target[:, 1] - y_m
+    ahead = ndist + (_AHEAD_M + _AHEAD_S * speed_mps) / track.length_m
+    there = track.start_pose(ahead)
+    # To the left of the centre line: to the outside of the bend in which the point is.
+    outside = -np.tanh(_turn_rad(track, ahead, _BEND_M) / _BEND_RAD)
+    side_m = outside * np.array([driver.outwards for driver in drivers]) * track.width_m / 2
+    dx = there.x - side_m * np.sin(there.yaw_rad) - x_m
+    dy = there.y + side_m * np.cos(there.yaw_rad) - y_m
     along, aside = dx * np.cos(yaw_rad) + dy * np.sin(yaw_rad), dy * np.cos(yaw_rad) - dx * np.sin(yaw_rad)
     curvature = 2.0 * aside / (along**2 + aside**2)
     angle_deg = np.degrees(np.arctan(_UNDERSTEER * car.wheelbase_m * curvature))
+    to_the_left = int(time_s / _WEAVE_S) % 2 == 0
+    angle_deg += np.array([driver.weave_deg for driver in drivers]) * (1 if to_the_left else -1)
     return np.clip(angle_deg, -car.max_steering_deg, car.max_steering_deg)

@@ -1,6 +1,6 @@
 """Warn of common mistakes in reward functions that run without an error; some are measured on driven laps."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -111,6 +111,24 @@ def lap_returns(setup: RaceSetup, laps: Sequence[DrivenLap], discount: float) ->
     return returns
 
 
+def flaws_return_more(good: LapReturn, flawed: Mapping[str, LapReturn]) -> Iterator[str]:
+    """Warn of laps with a flaw, by its name, that return more than the good lap, which is no slower."""
+    better = {name: lap for name, lap in flawed.items() if _grows(good.total, lap.total)}
+    if better:
+        laps = ", ".join(
+            f"{name} ({lap.total:.4g} in {lap.time_s:.1f} s"
+            f"{'' if _grows(good.discounted, lap.discounted) else '; not with the discount'})"
+            for name, lap in better.items()
+        )
+        yield (
+            f"returns more for a lap with a flaw than for a good one ({good.total:.4g} in {good.time_s:.1f} s): {laps}"
+        )
+
+
+def _grows(before: float, after: float) -> bool:
+    return after > before + _LAP_MARGIN * max(abs(before), abs(after))
+
+
 def slow_laps_return_as_much(laps: Sequence[LapReturn], discount: float) -> Iterator[str]:
     """Warn if a slower lap returns more than the fastest, or the fastest hardly more.
 
@@ -128,24 +146,21 @@ def slow_laps_return_as_much(laps: Sequence[LapReturn], discount: float) -> Iter
         scale = max(abs(slow.total), abs(fast.total), 1e-9)
         return (fast.total - slow.total) / scale / (1 - fast.time_s / slow.time_s)
 
-    def grows(before: float, after: float) -> bool:
-        return after > before + _LAP_MARGIN * max(abs(before), abs(after))
-
     slow = max(slower, key=lambda lap: lap.total)
-    if not grows(fast.total, slow.total):
+    if not _grows(fast.total, slow.total):
         slow = max(slower, key=lambda lap: lap.time_s)
     if gain(slow) >= _ASKS:
         return
     by_discount = f"({discount:g} a step: {slow.discounted:.4g} against {fast.discounted:.4g})"
-    helps = discount < 1 and grows(slow.discounted, fast.discounted)
-    if grows(fast.total, slow.total):
+    helps = discount < 1 and _grows(slow.discounted, fast.discounted)
+    if _grows(fast.total, slow.total):
         discounted = "only the discount asks for speed" if helps else "the discount does not make up for it"
         yield (
             f"returns more for a slow lap than for a fast one: {slow.total:.4g} in {slow.time_s:.1f} s, "
             f"{fast.total:.4g} in {fast.time_s:.1f} s; {discounted} {by_discount}"
         )
         return
-    asks = "little asks" if grows(slow.total, fast.total) else "nothing asks"
+    asks = "little asks" if _grows(slow.total, fast.total) else "nothing asks"
     yield (
         f"a lap in {slow.time_s:.1f} s returns {slow.total:.4g}, one in {fast.time_s:.1f} s {fast.total:.4g}: "
         f"{asks} for speed{' except the discount' if helps else ', and the discount does not either'} {by_discount}"

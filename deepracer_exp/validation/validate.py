@@ -3,7 +3,6 @@
 import shlex
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,20 +19,20 @@ from deepracer_exp.aws.worlds.routes import recognise
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.files import RaceFiles
 from deepracer_exp.env.setup import RaceSetup, build_setup
-from deepracer_exp.errors import BadInput, RunFailed, count, writing
+from deepracer_exp.errors import BadInput, count, writing
 from deepracer_exp.rewards.reward import RewardFailed
-from deepracer_exp.runs.files import METRICS, read_metrics
 from deepracer_exp.tracks.track import Track
 from deepracer_exp.training.plan import TrainPlan
 
 from . import pitfalls
 from .aws_dry_run import dry_run_findings
 from .aws_rules import AwsFinding, text_findings
-from .laps import action_space_laps
+from .laps import action_space_laps, flawed_laps
 from .objects import with_others
 from .pitfalls import LapReturn
 from .probe import NOT_CALLED, Answer, Coverage, Probe, lines_for_step_1, never_executed
 from .reward_map import RewardGrid, State, draw_reward_map, sample_reward_grid, state_of
+from .short_training import train_shortly
 from .situations import (
     FIRST_STEP,
     NamedSituation,
@@ -47,8 +46,6 @@ from .situations import (
 
 _MOST = 12
 """Most lines of one kind that are printed."""
-_FEWEST = 6
-"""Fewest iterations of a short training whose thirds can be compared."""
 _WARM = 25
 """Situations with which the time of a call is measured; the first calls may fill caches."""
 _SAMPLES = ((0.5e-3, 2000), (2.5e-3, 400), (float("inf"), 80))
@@ -99,7 +96,8 @@ def validate_reward(
     _print_lines(out, "Warnings", "yellow", check.warnings)
     _print_lines(out, "Failures", "red", check.failures)
     if trial is not None and not check.failures and not (strict and check.aws):
-        _train_shortly(out, err, trial)
+        for line in train_shortly(err, trial):
+            _line(out, line)
     return _verdict(out, check, strict)
 
 
@@ -126,6 +124,8 @@ class Check:
     state: State = "none"
     laps: list[LapReturn] = field(default_factory=list)
     """Returns of driven laps, slowest first; none where the function is too slow or constant."""
+    flawed: dict[str, LapReturn] = field(default_factory=dict)
+    """Returns of laps like the fastest of these, by the flaw that each of them has."""
     grid: RewardGrid | None = None
     """None: not sampled, because a call takes too long."""
 
@@ -243,6 +243,11 @@ def look_closer(check: Check) -> None:
     check.warnings += pitfalls.pays_for_standing(setup, laps)
     check.laps = pitfalls.lap_returns(setup, laps, check.discount)
     check.warnings += pitfalls.slow_laps_return_as_much(check.laps, check.discount)
+    if laps:
+        flawed = flawed_laps(setup, laps[-1])
+        returns = pitfalls.lap_returns(setup, list(flawed.values()), check.discount)
+        check.flawed = dict(zip(flawed, returns, strict=True))
+        check.warnings += pitfalls.flaws_return_more(check.laps[-1], check.flawed)
 
 
 def _execute_scenes(probe: Probe, check: Check) -> tuple[Coverage, int]:
@@ -370,15 +375,17 @@ def _print_situations(out: Console, check: Check) -> None:
 
 
 def _print_laps(out: Console, check: Check) -> None:
-    """Print what laps of one line at several speeds return."""
+    """Print what laps of one line at several speeds return, and laps with a flaw."""
     if not check.laps:
         return
-    table = Table("lap of the same line", box=None, pad_edge=False, padding=(0, 3, 0, 0), header_style="dim")
+    table = Table("lap", "driven", box=None, pad_edge=False, padding=(0, 3, 0, 0), header_style="dim")
     for name in ("return", f"discounted by {check.discount:g} a step"):
         table.add_column(name, justify="right")
-    for lap in check.laps:
-        table.add_row(f"{lap.time_s:.2f} s", f"{lap.total:.4g}", f"{lap.discounted:.4g}")
-    out.print(table)
+    *slower, good = check.laps
+    named = [*(("slower", lap) for lap in slower), ("well", good), *check.flawed.items()]
+    for name, lap in named:
+        table.add_row(f"{lap.time_s:.2f} s", name, f"{lap.total:.4g}", f"{lap.discounted:.4g}")
+    out.print(table, highlight=False)
     out.print()
 
 
@@ -405,47 +412,6 @@ def _print_first(out: Console, lines: list[str]) -> None:
         _line(out, f"  {line}")
     if len(lines) > _MOST:
         _line(out, f"  and {len(lines) - _MOST} more")
-
-
-def _train_shortly(out: Console, err: Console, plan: TrainPlan) -> None:
-    """Train and print whether anything improves."""
-    from deepracer_exp.training.run import run_training
-
-    outcome = run_training(plan, err)
-    if outcome.status == "failed":
-        raise RunFailed(f"trial: run failed: {outcome.reason}; see {outcome.folder}")
-    if outcome.status == "interrupted":
-        raise KeyboardInterrupt
-    rows = read_metrics(outcome.folder / METRICS)
-    _line(out, f"\nTrial: {rows[-1]['env_steps'] if rows else 0:,} steps -> {outcome.folder}")
-    for line in compare_thirds(rows) or ["too short to see whether anything improves; give it more time"]:
-        _line(out, f"  {line}")
-
-
-def compare_thirds(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Compare the first third of iterations, rows of metrics.jsonl, with the last; return a line for each metric.
-
-    A metric improves if it rises by more than twice the standard error of the difference.
-    """
-    third = len(rows) // 3
-    if len(rows) < _FEWEST:
-        return []
-    ended = np.diff([0, *(row["episodes"] for row in rows)])
-    lines = []
-    for key, name in (("completion", "per cent of the lap"), ("mean_return", "reward of an episode")):
-        first, last = (
-            np.array([row[key] for row in part if row[key] is not None])
-            for part in (rows[:third], rows[-third:])
-        )
-        if len(first) < 2 or len(last) < 2:
-            continue
-        error = np.hypot(first.std(ddof=1) / np.sqrt(len(first)), last.std(ddof=1) / np.sqrt(len(last)))
-        what = "improves" if last.mean() - first.mean() > 2 * error else "does not improve"
-        lines.append(
-            f"{name} {what}: {first.mean():.4g} in the first third ({ended[:third].sum():,} episodes), "
-            f"{last.mean():.4g} in the last ({ended[-third:].sum():,})"
-        )
-    return lines
 
 
 def _verdict(out: Console, check: Check, strict: bool) -> int:

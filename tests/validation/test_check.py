@@ -20,7 +20,7 @@ def reward_function(params):
     return gained
 """
 GOOD = function(
-    'return params["speed"] ** 2 - 5.0 * params["is_offtrack"] + params["progress"] / params["steps"]'
+    'pace = params["progress"] / params["steps"]\nreturn params["speed"] * pace**2 - 5.0 * params["is_offtrack"]'
 )
 
 

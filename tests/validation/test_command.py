@@ -10,7 +10,7 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.rewards.source import zoo_names
 from deepracer_exp.tracks.track import world_track
 from deepracer_exp.validation import validate as checking
-from deepracer_exp.validation.validate import compare_thirds
+from deepracer_exp.validation.short_training import compare_thirds
 
 pytestmark = pytest.mark.usefixtures("coarsely")
 

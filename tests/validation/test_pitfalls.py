@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from deepracer_exp.validation import pitfalls
+from deepracer_exp.validation.laps import flawed_laps
 from deepracer_exp.validation.probe import Probe
 from deepracer_exp.validation.reward_map import sample_reward_grid, state_of
 
@@ -127,6 +128,40 @@ def test_the_discount_is_said_to_ask_for_speed_only_where_it_does(slow, fast, di
 def test_laps_of_almost_the_same_time_are_not_compared():
     laps = [pitfalls.LapReturn(10.0, 100.0, 50.0), pitfalls.LapReturn(9.5, 50.0, 20.0)]
     assert not list(pitfalls.slow_laps_return_as_much(laps, 0.99))
+
+
+@pytest.fixture(scope="module")
+def flawed(race, laps):
+    return flawed_laps(race, laps[-1])
+
+
+@pytest.mark.parametrize(
+    ("text", "preferred"),
+    [
+        (paying("float(abs(params['steering_angle']) > 15) - 0.5"), {"zig-zag", "late braking"}),
+        (
+            paying("0.0 if params['is_left_of_center'] else params['distance_from_center']"),
+            {"zig-zag", "wide"},
+        ),
+        (paying("float(params['speed'] == 3.0)"), {"late braking"}),
+        (CENTER, {"zig-zag", "wide", "late braking"}),
+        (DELTA.replace("0.01", "0.3"), set()),
+    ],
+)
+def test_laps_with_a_flaw_are_named_where_they_return_more_than_the_good_one(
+    race_with, laps, flawed, text, preferred
+):
+    good, *returns = pitfalls.lap_returns(race_with(text), [laps[-1], *flawed.values()], 0.99)
+    found = list(pitfalls.flaws_return_more(good, dict(zip(flawed, returns, strict=True))))
+    assert len(found) == bool(preferred)
+    assert {name for name in flawed if any(f" {name} (" in line for line in found)} == preferred
+
+
+def test_a_flaw_that_only_the_discount_forbids_is_said_to_be_one():
+    good, wide = pitfalls.LapReturn(7.0, 100.0, 60.0), pitfalls.LapReturn(8.0, 110.0, 55.0)
+    (line,) = pitfalls.flaws_return_more(good, {"wide": wide})
+    assert line.endswith("a good one (100 in 7.0 s): wide (110 in 8.0 s; not with the discount)")
+    assert not list(pitfalls.flaws_return_more(good, {"wide": good}))
 
 
 def test_only_a_constant_reward_is_reported_as_constant():

@@ -5,7 +5,7 @@ import pytest
 
 from deepracer_exp.config.driving import DiscreteAction, DiscreteActionSpace
 from deepracer_exp.env.action_space import build_action_space
-from deepracer_exp.validation.laps import SHARES, action_space_laps, drive_laps
+from deepracer_exp.validation.laps import SHARES, Driver, action_space_laps, drive_laps, flawed_laps
 from deepracer_exp.validation.situations import named_situations, poses, sample, seam, situations, start
 
 
@@ -97,4 +97,31 @@ def test_a_single_action_gives_one_lap(race):
 
 
 def test_a_bend_taken_too_fast_gives_no_lap(race):
-    assert drive_laps(race, np.array([50.0]), np.array([1.0])) == [None]
+    assert drive_laps(race, [Driver(lateral_mps2=50.0)]) == [None]
+
+
+def test_each_lap_with_a_flaw_has_that_flaw_and_is_no_faster_than_the_good_one(race, laps):
+    good, flawed = laps[-1], flawed_laps(race, laps[-1])
+    assert set(flawed) == {"zig-zag", "wide", "late braking"}
+
+    def turns(lap):
+        return (np.diff(np.sign(lap.paid.columns["steering_angle"])) != 0).sum()
+
+    def steps_outside(lap):
+        """Most bends turn to the left."""
+        return (~lap.paid.columns["is_left_of_center"].astype(bool)).sum()
+
+    def steps_at_both_extremes(lap):
+        speed_mps = lap.paid.columns["speed"]
+        return ((speed_mps == lap.speed_mps) | (speed_mps < 1.2)).sum()
+
+    for flaw, measure in (
+        ("zig-zag", turns),
+        ("wide", steps_outside),
+        ("late braking", steps_at_both_extremes),
+    ):
+        assert measure(flawed[flaw]) > 2 * measure(good)
+    for lap in flawed.values():
+        assert lap.time_s >= good.time_s
+        assert lap.paid.columns["all_wheels_on_track"].all()
+        assert lap.paid.columns["progress"][-1] == 100
