@@ -23,7 +23,7 @@ endif
 INSTALL = $(BIN)/uv pip install --compile-bytecode --python $(BIN)/python --constraint constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help env race test test-long test-faults check bench docs clean
+.PHONY: help env race test test-long test-faults check extras bench docs clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 14
@@ -62,6 +62,9 @@ check: $(STAMP)  ## style, types and import rules
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports --no-cache
+
+extras: $(RACER)  ## whether every extra can be installed in the versions of constraints.txt
+	@$(BIN)/uv pip compile --quiet --python $(BIN)/python --constraint constraints.txt --all-extras pyproject.toml -o /dev/null
 
 bench: $(STAMP)  ## re-measure what the README claims
 	@$(BIN)/python -m benchmarks.throughput

@@ -1,9 +1,11 @@
 """The cars as a vectorised environment of Stable-Baselines3, which `pip install 'deepracer-exp[sb3]'` brings along.
 
 from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecMonitor
 from deepracer_exp.env.sb3 import DeepRacerVecEnv
 
-PPO("MlpPolicy", DeepRacerVecEnv(64, ["track=Oval_track"]), n_steps=128, batch_size=1024).learn(500_000)
+cars = VecMonitor(DeepRacerVecEnv(64, ["track=Oval_track"]))
+PPO("MlpPolicy", cars, n_steps=128, batch_size=1024).learn(500_000)
 """
 
 from collections.abc import Iterable, Sequence

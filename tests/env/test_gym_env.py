@@ -8,7 +8,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import RenderCollection
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 from deepracer_exp.env.gym_env import DeepRacerEnv, DeepRacerVectorEnv
 from deepracer_exp.env.sb3 import DeepRacerVecEnv
@@ -128,14 +128,15 @@ def test_gymnasiums_vector_wrappers_take_it():
 
 
 @pytest.mark.parametrize("space", SPACES)
-def test_stable_baselines_trains_on_the_vector_environment(space):
-    cars = DeepRacerVecEnv(8, [space, "episode.max_steps=40"])
+def test_stable_baselines_trains_on_the_vector_environment_and_logs_its_episodes(space):
+    cars = VecMonitor(DeepRacerVecEnv(8, [space, "episode.max_steps=40"]))
     model = PPO("MlpPolicy", cars, n_steps=32, batch_size=64, n_epochs=2, device="cpu", seed=0)
     before = [p.clone() for p in model.policy.parameters()]
     model.learn(3 * 8 * 32)
     assert model.num_timesteps == 768
     assert all(p.isfinite().all() for p in model.policy.parameters())
     assert any((p != q).any() for p, q in zip(model.policy.parameters(), before, strict=True))
+    assert 0 < np.mean([episode["l"] for episode in model.ep_info_buffer]) <= 40
 
 
 def test_stable_baselines_drives_the_same_cars_and_is_told_how_episodes_ended():
