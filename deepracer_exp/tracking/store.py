@@ -41,6 +41,8 @@ os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
 # Without a network it would be retried during the whole run.
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
 
+ARTIFACTS = "mlflow-artifacts"
+"""The folder, in `runs_dir`, of the files that MLflow keeps of runs in a database of this machine."""
 _SERVERS = ("http", "https")
 _DATABASES = ("sqlite", "postgresql", "mysql", "mssql")
 _SQLITE_PREFIX = "sqlite:///"
@@ -114,9 +116,29 @@ class Store:
                 f"keeps the files at {without_passwords(place)[:200]}; accepted: "
                 + ("on the server itself" if self.is_server else "a folder")
             )
+        if (moved := self.moved_folder(place)) is not None:
+            place = moved.as_uri()
         from mlflow.store.artifact.artifact_repository_registry import get_artifact_repository
 
         return get_artifact_repository(place, tracking_uri=self.uri)
+
+    def moved_folder(self, place: str) -> Path | None:
+        """Return where the artifacts at a place are now, if the store was moved or copied with its folder; None if not.
+
+        MLflow stores absolute paths, and has no call that changes that of a run or an experiment. `place` is such a
+        path or URI, of a folder in `mlflow-artifacts`.
+        """
+        if self.sqlite_file is None or urlsplit(place).scheme not in ("", "file"):
+            return None
+        then = Path(unquote(urlsplit(place).path))
+        root = next((folder for folder in then.parents if folder.name == ARTIFACTS), None)
+        now = self.sqlite_file.with_name(ARTIFACTS)
+        if root is None or root.resolve() == now.resolve():
+            return None
+        # Of another runs_dir that is recorded in this store, unless it lies beside this store's original.
+        if root.exists() and not root.with_name(self.sqlite_file.name).exists():
+            return None
+        return now / then.relative_to(root)
 
     @contextmanager
     def creation_lock(self) -> Iterator[None]:
@@ -138,7 +160,7 @@ def resolve_store(uri: str | None, runs_dir: Path) -> Store:
     Raises:
         BadInput: `uri` can never work: unknown scheme, no host, a folder that cannot be made or written.
     """
-    artifacts = (runs_dir.absolute() / "mlflow-artifacts").as_uri()
+    artifacts = (runs_dir.absolute() / ARTIFACTS).as_uri()
     if uri is None:
         file = runs_dir.absolute() / MLFLOW_DB
         _check_sqlite_file(file, f"runs_dir={runs_dir}")

@@ -1,5 +1,6 @@
 import contextlib
 import re
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.tracking.loggers import open_tracker
 from deepracer_exp.tracking.mlflow_run import MLflowRun
 from deepracer_exp.tracking.store import resolve_store
+from deepracer_exp.tracking.tracking_file import TrackedRun
 from tests.conftest import refused
 
 SERVERS = "accepted: http(s)://host:port"
@@ -94,3 +96,49 @@ def test_a_store_copied_from_an_empty_one_is_what_mlflow_makes(tmp_path):
     for folder in folders:  # the second one is a copy, even if this installation has never made a store
         MLflowRun(resolve_store(None, folder))
         assert _tables(folder / "mlflow.db") == _tables(tmp_path / "its_own.db")
+
+
+@pytest.fixture
+def recorded(tmp_path):
+    """Return the folder of a project with a run that has a file, and the run."""
+    project = tmp_path / "before"
+    run = MLflowRun(resolve_store(None, project))
+    run.open(TrackedRun("run", "race", 1_000), is_first=True)
+    (tmp_path / "file.txt").write_text("first", encoding="utf-8")
+    run.log_artifact(tmp_path / "file.txt", None)
+    return project, run.run_id
+
+
+@pytest.mark.parametrize("is_copied", [False, True])
+def test_a_moved_store_gets_its_files_where_it_is_now_and_none_where_it_was(recorded, tmp_path, is_copied):
+    before, run_id = recorded
+    (tmp_path / "file.txt").write_text("second", encoding="utf-8")
+    after = tmp_path / "after ü"
+    shutil.copytree(before, after)
+    if not is_copied:
+        shutil.rmtree(before)
+    there = sorted(before.rglob("*"))
+    store = resolve_store(None, after)
+    run = MLflowRun(store)
+    run.read(run_id)
+    run.log_artifact(tmp_path / "file.txt", "evaluations")
+    new = MLflowRun(store)
+    new.open(TrackedRun("second", "race", 2_000), is_first=True)
+    new.log_artifact(tmp_path / "file.txt", None)
+    files = after / "mlflow-artifacts"
+    assert (files / run_id / "artifacts" / "file.txt").read_text() == "first"
+    assert (files / run_id / "artifacts" / "evaluations" / "file.txt").read_text() == "second"
+    assert (files / new.run_id / "artifacts" / "file.txt").read_text() == "second"
+    assert sorted(before.rglob("*")) == there
+
+
+def test_a_store_that_has_not_moved_leaves_its_files_to_mlflow(recorded, tmp_path):
+    before, run_id = recorded
+    store = resolve_store(None, before)
+    place = MlflowClient(store.uri).get_run(run_id).info.artifact_uri
+    assert store.moved_folder(place) is None
+    # That of runs in another folder which are recorded here is no earlier place of this store.
+    elsewhere = tmp_path / "elsewhere" / "mlflow-artifacts"
+    elsewhere.mkdir(parents=True)
+    assert store.moved_folder((elsewhere / "0" / "artifacts").as_uri()) is None
+    assert resolve_store("http://127.0.0.1:1", before).moved_folder("mlflow-artifacts:/0/artifacts") is None
