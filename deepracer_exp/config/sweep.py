@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -80,6 +80,7 @@ class SweepConfig:
     lease_s: Seconds
     patience_s: Seconds
     storage: Annotated[str, Field(min_length=1)] | None
+    enqueue: tuple[dict[str, Any] | str, ...]
     executor: ExecutorConfig
     train: tuple[str, ...]
     space: dict[str, str]

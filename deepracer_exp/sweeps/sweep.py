@@ -38,6 +38,7 @@ from . import PAGE_FILE
 from .plan import SweepPlan
 from .queue.claims import Claim, TrialClaims, report_results
 from .queue.driver import Driver
+from .queue.enqueued import enqueue, known_settings
 from .queue.launcher import LocalLauncher
 from .queue.ray_launcher import RayLauncher
 from .queue.storage import open_storage, patiently, resolve_database
@@ -90,6 +91,7 @@ def sweep(plan: SweepPlan, console: Console) -> tuple[Study, Path, int]:
     space = SearchSpace.from_request(request, check)
     build_sampler(config, space)
     build_pruner(config)
+    known = known_settings(request, space)
     example = plan_one(space.example())
     experiment = example.experiment
     for note in (*request.composition.notes, *example.composition.notes) if request.stored else ():
@@ -109,7 +111,9 @@ def sweep(plan: SweepPlan, console: Console) -> tuple[Study, Path, int]:
     )
     with contextlib.closing(launcher):
         storage = open_storage(config.storage, runs_dir)
-        study = open_study(request, overrides, space, parent, storage, runs_dir)
+        with resolve_database(config.storage, runs_dir).creation_lock(storage.engine):
+            study = open_study(request, overrides, space, parent, storage, runs_dir)
+            enqueue(study, known)
         acting.remember()
         # Only runs above the seeds of a trial cannot do without it; the id of an earlier start may be of another store.
         waits = config.seeds > 1 or RUN_ID in study.user_attrs

@@ -1,5 +1,6 @@
 """Studies: begun, found by name, and resumed with the overrides they were begun with."""
 
+import logging
 import warnings
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -17,17 +18,20 @@ from deepracer_exp.sweeps import DEFAULT_FILE
 from deepracer_exp.sweeps.search.objectives import MEASURES
 
 from .claims import TABLE
-from .storage import open_storage
+from .storage import open_storage, resolve_database
 
 if TYPE_CHECKING:  # to find a study needs nothing of what composes one
+    from deepracer_exp.config.compose import Composition
     from deepracer_exp.config.sweep import SweepRequest
     from deepracer_exp.sweeps.search.space import SearchSpace
 
     from .worker_config import Parent
 
+_log = logging.getLogger("deepracer_exp")
+
 MAY_DIFFER = (
     *("study", "debug", "sweep/executor", "sweep.trials", "sweep.workers", "sweep.storage", "sweep.lease_s"),
-    *("sweep.patience_s", "sweep.rerank", "sweep.rerank_laps", "runs_dir"),
+    *("sweep.patience_s", "sweep.rerank", "sweep.rerank_laps", "sweep.enqueue", "runs_dir"),
 )
 """Keys that do not change the trials themselves."""
 _SAME = ("objectives", "seeds", "protocol", "parent")
@@ -47,6 +51,30 @@ def find_study(name: str, storage: RDBStorage) -> Study | None:
     if "space" in study.user_attrs and study.user_attrs.get("claims") != TABLE:
         raise BadInput(f"study {name}: an earlier version began it, and alone can read it; give another name")
     return study
+
+
+COMPLETE = "is_complete"
+"""Attribute of a wider study under its first name: it has all trials, and replaces the other one."""
+
+
+def aside(name: str) -> str:
+    """Return the name under which a wider study is made."""
+    return f"{name} (wider)"
+
+
+def complete_widening(name: str, storage: RDBStorage) -> None:
+    """Replace a study by the wider one beside it, if there is one with all trials; no other process does so now."""
+    try:
+        wider = optuna.load_study(study_name=aside(name), storage=storage)
+    except KeyError:
+        return
+    if COMPLETE in wider.user_attrs:
+        if name in optuna.get_all_study_names(storage):
+            optuna.delete_study(study_name=name, storage=storage)
+        optuna.copy_study(
+            from_study_name=aside(name), from_storage=storage, to_storage=storage, to_study_name=name
+        )
+        optuna.delete_study(study_name=aside(name), storage=storage)
 
 
 def load_study(name: str, storage: RDBStorage) -> Study:
@@ -105,9 +133,15 @@ def open_study(
 ) -> Study:
     """Begin a study, or open the study of that name; all trials are clones of `parent`, if there is one.
 
+    A study that exists is widened if `space` has all values of its own.
+
     Raises:
-        BadInput: a study of that name exists, and its trials cannot be compared with these.
+        BadInput: a study of that name exists, and its trials cannot be compared with these; or one of them is running
+            and the search is a wider one.
     """
+    from .widening import widen
+    from .worker_config import plan_trial
+
     name, sweep = request.study, request.entry.sweep
     wanted = {
         "base": list(request.base),
@@ -136,8 +170,20 @@ def open_study(
         for key, value in wanted.items():
             study.set_user_attr(key, value)
     else:
-        differences = [*space.difference(stored["space"]), *_differences(stored, wanted)]
-        if differences:
+        changes = space.difference(stored["space"])
+        differences = _differences(stored, wanted, {*space.as_text()} - {*stored["space"]})
+        if changes and not differences and space.is_wider_than(stored["space"]):
+
+            def composed(lines: list[str]) -> "Composition":
+                return plan_trial(lines, parent, stored=True).composition
+
+            study = widen(study, storage, space, wanted, composed)
+            _log.warning(
+                "study %s: a wider search from now on, with the %d trials that it has: %s",
+                *(name, len(study.get_trials(deepcopy=False)), "; ".join(changes)),
+            )
+        elif changes or differences:
+            differences = [*changes, *differences]
             raise BadInput(
                 f"study={name}: exists with another search: {'; '.join(differences)}; give another name, or "
                 f"resume it with `deepracer-exp sweep study={name}` alone"
@@ -150,10 +196,15 @@ def open_study(
     return study
 
 
-def _differences(stored: dict[str, object], wanted: dict[str, object]) -> list[str]:
+def _differences(stored: dict[str, object], wanted: dict[str, object], searched: set[str]) -> list[str]:
+    """Return a line for each difference that makes trials incomparable; `searched` are keys that were not before."""
+    from deepracer_exp.config.overrides import key_of
+
     lines = [f"{key}: {stored.get(key)} -> {wanted[key]}" for key in _SAME if stored.get(key) != wanted[key]]
     before, now = (
-        [line for line in base if not _says_where(line)] if isinstance(base, list) else []
+        [line for line in base if not _says_where(line) and key_of(line) not in searched]
+        if isinstance(base, list)
+        else []
         for base in (stored.get("base"), wanted["base"])
     )
     if before != now:
@@ -175,5 +226,9 @@ def _existing(request: "SweepRequest", must_exist: bool) -> Study | None:
         return None
     if request.entry.sweep.storage is None and not (request.runs_dir / DEFAULT_FILE).exists():
         return None
+    address, runs_dir = request.entry.sweep.storage, request.runs_dir
+    storage = open_storage(address, runs_dir)
+    with resolve_database(address, runs_dir).creation_lock(storage.engine):
+        complete_widening(request.study, storage)
     find = load_study if must_exist else find_study
-    return find(request.study, open_storage(request.entry.sweep.storage, request.runs_dir))
+    return find(request.study, storage)

@@ -10,6 +10,7 @@ from typing import TypeVar
 
 import optuna
 from optuna.storages import RDBStorage
+from optuna.trial import TrialState
 
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.sweeps.search.pruners import build_pruner
@@ -112,7 +113,10 @@ class Worker:
         storage = self._storage
         study_id = storage.get_study_id_from_name(self._config.study)
         with contextlib.suppress(KeyError):
-            return storage.get_trial_id_from_study_id_trial_number(study_id, number)
+            trial_id = storage.get_trial_id_from_study_id_trial_number(study_id, number)
+            if storage.get_trial(trial_id).state == TrialState.WAITING:  # enqueued
+                storage.set_trial_state_values(trial_id, TrialState.RUNNING)
+            return trial_id
         with self._database.creation_lock(storage.engine):
             with contextlib.suppress(KeyError):
                 return storage.get_trial_id_from_study_id_trial_number(study_id, number)

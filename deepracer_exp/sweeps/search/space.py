@@ -40,6 +40,24 @@ class Dimension:
     options: tuple[Choice, ...] | None
     """Options of that group for which the key counts; None: all."""
 
+    def matching(self, value: Any) -> list[Choice]:
+        """Return the value of this dimension that equals a plain value; an empty list if none does."""
+        what = dimension(self.key, self.expression)
+        if isinstance(what, Choices):
+            plain = [(choice, override_value(as_override(self.key, choice))) for choice in what.values]
+            is_truth = isinstance(value, bool)  # 1 == True
+            return [choice for choice, its in plain if its == value and isinstance(its, bool) == is_truth]
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, int | float)
+            or not what.low <= value <= what.high
+        ):
+            return []
+        steps = 0.0 if what.step is None else (value - what.low) / what.step
+        if abs(steps - round(steps)) > 1e-9:
+            return []
+        return [int(value) if isinstance(self.distribution, IntDistribution) else float(value)]
+
 
 @dataclass(frozen=True)
 class SearchSpace:
@@ -98,6 +116,14 @@ class SearchSpace:
             elif before != now and dimension(key, before) != dimension(key, now):
                 lines.append(f"{key}: {before} -> {now}")
         return lines
+
+    def is_wider_than(self, other: Mapping[str, str]) -> bool:
+        """Return whether this space has all values of another one, from its `as_text`."""
+        here = self.as_text()
+        return all(
+            key in here and _contains(dimension(key, here[key]), dimension(key, expression))
+            for key, expression in other.items()
+        )
 
     def grid(self) -> dict[str, list[Choice]]:
         """Return all values by key.
@@ -227,6 +253,28 @@ class _Trials:
             reward = parse_experiment(dict(values)).reward
             return key.removeprefix(f"{_CONSTANTS}.") in load_reward_source(reward).constants
         return _holder(values, key) is not None
+
+
+def _contains(wider: Choices | Range, narrower: Choices | Range) -> bool:
+    """Return whether a dimension has all values of another, on the same scale."""
+    if isinstance(wider, Choices) and isinstance(narrower, Choices):
+        typed = [(type(value), value) for value in wider.values]
+        return all((type(value), value) in typed for value in narrower.values)
+    if not isinstance(wider, Range) or not isinstance(narrower, Range) or wider.log != narrower.log:
+        return False
+    if not (wider.low <= narrower.low and narrower.high <= wider.high):
+        return False
+    if wider.step is None or wider.step == narrower.step:
+        steps = 0.0 if wider.step is None else (narrower.low - wider.low) / wider.step
+        return abs(steps - round(steps)) < 1e-9
+    return False
+
+
+def value_at(values: Mapping[str, Any], key: str) -> list[Any]:
+    """Return the value of a key in all values of an experiment; an empty list if it does not exist."""
+    holder = _holder(values, key)
+    leaf = key.rpartition(".")[2]
+    return [holder[leaf]] if holder is not None and leaf in holder else []
 
 
 def _holder(values: Mapping[str, Any], key: str) -> dict[str, Any] | None:

@@ -1,0 +1,176 @@
+"""A study is given a wider search, and settings to begin with, in real databases and without trainings."""
+
+import optuna
+import pytest
+from optuna.distributions import CategoricalDistribution
+from optuna.trial import TrialState
+
+from deepracer_exp.config.compose import compose_evaluation
+from deepracer_exp.config.sweep import compose_sweep
+from deepracer_exp.sweeps.queue.claims import TrialClaims
+from deepracer_exp.sweeps.queue.enqueued import enqueue, known_settings
+from deepracer_exp.sweeps.queue.storage import open_storage
+from deepracer_exp.sweeps.queue.study import complete_widening, open_study
+from deepracer_exp.sweeps.queue.trial_run import TrialRun
+from deepracer_exp.sweeps.queue.worker import Worker
+from deepracer_exp.sweeps.queue.worker_config import WorkerConfig
+from deepracer_exp.sweeps.search.space import SearchSpace
+from deepracer_exp.training.signals import Interruption
+from tests.conftest import refused
+
+LR = "algorithm.lr=tag(log,interval(1e-5,1e-3))"
+NETWORK = "network=mlp_small,mlp"
+
+
+@pytest.fixture(autouse=True)
+def untrained(monkeypatch):
+    monkeypatch.setattr(
+        TrialRun, "_ended", lambda self, overrides: self._as_trial("COMPLETE", [9.0 + self._number])
+    )
+
+
+@pytest.fixture
+def storage(url, tmp_path):
+    return open_storage(url, tmp_path)
+
+
+@pytest.fixture
+def started(url, storage, tmp_path):
+    """Return a function that begins or continues the study as its driver does, and returns it with a worker."""
+
+    def start(*asked):
+        overrides = [*asked, "tracking=off", "study=s", f"sweep.storage={url}", "sweep.startup_trials=2"]
+        request = compose_sweep([*overrides, f"runs_dir={tmp_path}"])
+        space = SearchSpace.from_request(request)
+        known = known_settings(request, space)
+        complete_widening("s", storage)
+        study = open_study(request, overrides, space, None, storage, tmp_path)
+        enqueue(study, known)
+        config = WorkerConfig(
+            study="s", runs_dir=tmp_path, config=request.entry.sweep,
+            protocol=compose_evaluation(["evaluation=sweep"])[0].evaluation,
+            space=space, parent=None, store=None, study_run_id=None, evaluations=None, cores=1,
+        )  # fmt: skip
+        return study, Worker(config, storage, "host:1:a")
+
+    return start
+
+
+@pytest.fixture
+def made(started):
+    def make(*asked):
+        study, worker = started(*asked)
+        worker.work(Interruption())
+        return study.get_trials()
+
+    return make
+
+
+def test_a_search_with_another_choice_and_a_wider_interval_keeps_the_trials(made):
+    before = made(LR, NETWORK, "sweep.trials=4")
+    after = made(
+        "algorithm.lr=tag(log,interval(1e-6,1e-2))", "network=mlp,mlp_small,mlp_deep", "sweep.trials=6"
+    )
+    assert [trial.number for trial in after] == list(range(6))
+    for old, kept in zip(before, after[:4], strict=True):
+        assert (kept.params, kept.values, kept.state) == (old.params, old.values, old.state)
+        assert kept.user_attrs == old.user_attrs
+        assert kept.datetime_complete == old.datetime_complete
+    assert {trial.distributions["network"] for trial in after} == {
+        CategoricalDistribution(("mlp", "mlp_small", "mlp_deep"))
+    }
+    assert made("algorithm.lr=tag(log,interval(1e-6,1e-2))", "network=mlp,mlp_small,mlp_deep", "sweep.trials=6")
+
+
+def test_a_key_that_was_fixed_gets_the_value_that_trials_were_trained_with(made):
+    made(LR, "algorithm.entropy_coeff=0.02", "network=mlp_small", "sweep.trials=3")
+    after = made(
+        LR, "algorithm.entropy_coeff=interval(0,0.05)", NETWORK, "algorithm.epochs=20,30", "sweep.trials=5"
+    )
+    for kept in after[:3]:
+        assert (kept.params["algorithm.entropy_coeff"], kept.params["network"]) == (0.02, "mlp_small")
+        # Trained with a number of epochs that is not searched.
+        assert kept.params.keys() == {"algorithm.lr", "algorithm.entropy_coeff", "network"}
+    assert all(len(trial.params) == 4 for trial in after[3:])
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        ("algorithm.lr=tag(log,interval(1e-4,1e-3))", NETWORK),
+        ("algorithm.lr=interval(1e-5,1e-3)", NETWORK),
+        (LR, "network=mlp,mlp_deep"),
+        (LR,),
+        (LR, "network=mlp_small,mlp,mlp_deep", "track=Oval_track"),
+        (LR, "network=mlp_small,mlp,mlp_deep", "sweep.seeds=2"),
+    ],
+)
+def test_a_search_that_leaves_something_out_or_changes_every_trial_is_refused(made, started, asked):
+    before = made(LR, NETWORK, "sweep.trials=2")
+    assert "exists with another search" in refused(started, *asked, "sweep.trials=4")
+    assert made(LR, NETWORK, "sweep.trials=2") == before
+
+
+def test_a_study_with_a_running_trial_is_not_widened(started, storage):
+    started(LR, NETWORK, "sweep.trials=2")
+    claims = TrialClaims(storage.engine, "s")
+    assert claims.claim("elsewhere:1:b", 2, 60.0)
+    assert "trial 0 is running" in refused(started, LR, "network=mlp_small,mlp,mlp_deep", "sweep.trials=2")
+    claims.release("elsewhere:1:b")
+    assert started(LR, "network=mlp_small,mlp,mlp_deep", "sweep.trials=2")
+
+
+@pytest.mark.parametrize("killed_in", ["add_trial", "delete_study", "copy_study"])
+def test_whatever_kills_the_process_no_trial_is_lost(made, started, storage, monkeypatch, killed_in):
+    before = made(LR, NETWORK, "sweep.trials=3")
+    wider = (LR, "network=mlp_small,mlp,mlp_deep", "sweep.trials=3")
+
+    def killed(*args, **options):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(optuna.Study if killed_in == "add_trial" else optuna, killed_in, killed)
+        with pytest.raises(KeyboardInterrupt):
+            started(*wider)
+    assert "s" in optuna.get_all_study_names(storage) or killed_in == "copy_study"
+    after = made(*wider)
+    assert [(trial.params, trial.values) for trial in after] == [
+        (trial.params, trial.values) for trial in before
+    ]
+
+
+def test_known_settings_are_tried_first_and_once(made):
+    asked = (LR, NETWORK, "sweep.enqueue=[{algorithm.lr: 5e-4, network: mlp}, {algorithm.lr: 2e-4}]")
+    trials = made(*asked, "sweep.trials=4")
+    assert trials[0].params == {"algorithm.lr": 5e-4, "network": "mlp"}
+    assert trials[1].params["algorithm.lr"] == 2e-4
+    assert trials[2].params["algorithm.lr"] not in (5e-4, 2e-4)
+    assert [trial.state for trial in trials] == [TrialState.COMPLETE] * 4
+    more = made(
+        *asked[:2],
+        "sweep.enqueue=[{algorithm.lr: 5e-4, network: mlp}, {algorithm.lr: 3e-4}]",
+        "sweep.trials=5",
+    )
+    assert [trial.params for trial in more[:4]] == [trial.params for trial in trials]
+    assert more[4].params["algorithm.lr"] == 3e-4
+
+
+def test_a_run_gives_its_values_of_the_searched_keys(made, trained, tmp_path):
+    run = trained("algorithm.lr=4e-4").folder
+    (first, *_) = made(LR, NETWORK, f"sweep.enqueue=[{run}]", "sweep.trials=1")
+    assert first.params["algorithm.lr"] == 4e-4
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("{algorithm.lr: 1.0}", ["algorithm.lr=1.0 is not searched", LR]),
+        ("{network: mlp_deep}", ["network=mlp_deep is not searched", NETWORK]),
+        ("{algorithm.epochs: 3}", ["algorithm.epochs is not searched", "algorithm.lr"]),
+        ("{}", ["none of the keys that are searched"]),
+        ("no_such_run", ["no_such_run"]),
+    ],
+)
+def test_a_setting_outside_the_search_is_refused(started, setting, words):
+    message = refused(started, LR, NETWORK, f"sweep.enqueue=[{setting}]", "sweep.trials=1")
+    assert all(word in message for word in words)
