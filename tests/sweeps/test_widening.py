@@ -79,7 +79,9 @@ def test_a_search_with_another_choice_and_a_wider_interval_keeps_the_trials(made
     assert {trial.distributions["network"] for trial in after} == {
         CategoricalDistribution(("mlp", "mlp_small", "mlp_deep"))
     }
-    assert made("algorithm.lr=tag(log,interval(1e-6,1e-2))", "network=mlp,mlp_small,mlp_deep", "sweep.trials=6")
+    assert made(
+        "algorithm.lr=tag(log,interval(1e-6,1e-2))", "network=mlp,mlp_small,mlp_deep", "sweep.trials=6"
+    )
 
 
 def test_a_key_that_was_fixed_gets_the_value_that_trials_were_trained_with(made):

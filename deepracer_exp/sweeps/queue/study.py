@@ -118,7 +118,7 @@ def with_stored(
     if not request.space:
         raise BadInput(
             f"study={request.study}: exists; to resume it, give only {', '.join(MAY_DIFFER)} beside its "
-            "name; for anything else give the whole search again"
+            "name; to widen its search give all of it again"
         )
     return overrides, request, study
 
@@ -139,6 +139,8 @@ def open_study(
         BadInput: a study of that name exists, and its trials cannot be compared with these; or one of them is running
             and the search is a wider one.
     """
+    from deepracer_exp.config.overrides import key_of
+
     from .widening import widen
     from .worker_config import plan_trial
 
@@ -152,8 +154,8 @@ def open_study(
         "parent_run": None if parent is None else asdict(parent),
         "runs_dir": str(runs_dir),
         "claims": TABLE,
-        # The address may contain a password, and is given again to resume.
-        "overrides": [line for line in overrides if not line.lstrip("+").startswith("sweep.storage=")],
+        # The address may contain a password, and is given again to resume; what was enqueued is among the trials.
+        "overrides": [line for line in overrides if key_of(line) not in ("sweep.storage", "sweep.enqueue")],
         # The last one: a study that has it has all of them.
         "space": space.as_text(),
     }
