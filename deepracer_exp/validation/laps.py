@@ -102,12 +102,12 @@ def flawed_laps(setup: RaceSetup, good: DrivenLap) -> dict[str, DrivenLap]:
         ],
     }
     driven = iter(drive_laps(setup, [driver for drivers in flaws.values() for driver in drivers]))
-    found: dict[str, DrivenLap] = {}
+    flawed: dict[str, DrivenLap] = {}
     for name, drivers in flaws.items():
         for lap in [next(driven) for _ in drivers]:
             if lap is not None and lap.time_s >= good.time_s:
-                found.setdefault(name, lap)
-    return found
+                flawed.setdefault(name, lap)
+    return flawed
 
 
 def drive_laps(setup: RaceSetup, drivers: Sequence[Driver]) -> list[DrivenLap | None]:
