@@ -91,7 +91,7 @@ def sweep(plan: SweepPlan, console: Console) -> tuple[Study, Path, int]:
     space = SearchSpace.from_request(request, check)
     build_sampler(config, space)
     build_pruner(config)
-    known = known_settings(request, space)
+    settings = known_settings(request, space)
     example = plan_one(space.example())
     experiment = example.experiment
     for note in (*request.composition.notes, *example.composition.notes) if request.stored else ():
@@ -113,7 +113,7 @@ def sweep(plan: SweepPlan, console: Console) -> tuple[Study, Path, int]:
         storage = open_storage(config.storage, runs_dir)
         with resolve_database(config.storage, runs_dir).creation_lock(storage.engine):
             study = open_study(request, overrides, space, parent, storage, runs_dir)
-            enqueue(study, known)
+            enqueue(study, settings)
         acting.remember()
         # Only runs above the seeds of a trial cannot do without it; the id of an earlier start may be of another store.
         waits = config.seeds > 1 or RUN_ID in study.user_attrs

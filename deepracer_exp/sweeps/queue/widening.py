@@ -64,7 +64,8 @@ def widen(
     wider = optuna.create_study(study_name=aside(name), storage=storage, directions=study.directions)
     for trial in study.get_trials():
         wider.add_trial(_in_space(trial, space, composed))
-    for key, value in {**study.user_attrs, **attributes, COMPLETE: True}.items():
+    kept = {key: value for key, value in study.user_attrs.items() if key != COMPLETE}
+    for key, value in {**kept, **attributes, COMPLETE: True}.items():  # that it is complete comes last
         wider.set_user_attr(key, value)
     complete_widening(name, storage)
     return optuna.load_study(study_name=name, storage=storage)
