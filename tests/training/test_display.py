@@ -9,8 +9,8 @@ from collections.abc import Callable
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rich.console import Console
 
+from deepracer_exp.commands.output import plain_console
 from deepracer_exp.training.display import (
     LINE_S,
     NOTHING,
@@ -54,7 +54,7 @@ class Clock:
 def screen(width: int, height: int, header: RunHeader, *updates: tuple) -> list[str]:
     """The lines of the last drawing on a terminal of this size."""
     file = io.StringIO()
-    console = Console(
+    console = plain_console(
         file=file, force_terminal=True, width=width, height=height, color_system=None, legacy_windows=False
     )
     with ProgressDisplay(console, header, Clock()) as display:
@@ -70,7 +70,7 @@ def screen(width: int, height: int, header: RunHeader, *updates: tuple) -> list[
 def lines(act: Callable[[ProgressDisplay, Clock], None], header: RunHeader = HEADER) -> list[str]:
     """What is written where there is no terminal."""
     file, clock = io.StringIO(), Clock()
-    with ProgressDisplay(Console(file=file, width=80), header, clock) as display:
+    with ProgressDisplay(plain_console(file=file, width=80), header, clock) as display:
         act(display, clock)
     return file.getvalue().splitlines()
 
@@ -141,7 +141,7 @@ def test_without_a_terminal_there_are_single_plain_lines():
 def test_the_time_on_a_terminal_moves_while_an_iteration_takes_long(monkeypatch):
     monkeypatch.setattr("deepracer_exp.training.display._MOVE_S", 0.01)
     clock, file = Clock(), io.StringIO()
-    console = Console(file=file, force_terminal=True, width=100, height=30, legacy_windows=False)
+    console = plain_console(file=file, force_terminal=True, width=100, height=30, legacy_windows=False)
     with ProgressDisplay(console, HEADER, clock) as display:
         display.update(ROW, 0.67, 23.0)
         assert "1:15" not in file.getvalue()
@@ -152,7 +152,7 @@ def test_the_time_on_a_terminal_moves_while_an_iteration_takes_long(monkeypatch)
 def test_a_terminal_that_cannot_draw_in_place_gets_plain_lines(monkeypatch):
     monkeypatch.setenv("TERM", "dumb")
     file = io.StringIO()
-    with ProgressDisplay(Console(file=file, force_terminal=True), HEADER, Clock()) as display:
+    with ProgressDisplay(plain_console(file=file, force_terminal=True), HEADER, Clock()) as display:
         display.update(ROW, 0.67, 23.0)
     assert "\x1b" not in file.getvalue()
     assert "iteration 40" in file.getvalue()
