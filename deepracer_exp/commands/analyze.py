@@ -12,10 +12,8 @@ from .output import check_file
 from .pages import (
     add_page,
     add_replay,
-    drive_given,
     end_with_page,
     page_name,
-    read_drive,
     run_or_logs,
     write_laps,
 )
@@ -32,8 +30,6 @@ _EPILOG = """\
   deepracer-exp analyze RUN --target 9.5 --open             the chance of a lap under 9.5 s; open the page
   deepracer-exp analyze RUN --replay laps.html              its fastest exploring lap beside an ordinary one
   deepracer-exp analyze RUN --line line.py                  the line of its fastest exploring lap, for a reward function
-  deepracer-exp analyze my_model-20261126-101500            the log of a physical car's drive (a ROS bag)
-  deepracer-exp analyze my_model-20261126-101500 RUN        and what RUN's policy would have done on its pictures
 
 The page needs no network: the outcome and the next steps, findings in words, figures and tables, and what could not be
 read and why. With --replay or --line alone no page is written. `deepracer-exp compare` puts runs and logs beside each
@@ -58,9 +54,9 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         "runs_dir=DIR | tracking.uri=URI",
         many=True,
         metavar="RUN | LOGS",
-        help="a run, logs of the service, or the log of a physical car's drive",
+        help="a run, or logs of the service",
     )
-    parser.usage = "%(prog)s [-h] [OPTION ...] RUN | LOGS | DRIVE [RUN] [KEY=VALUE ...]"
+    parser.usage = "%(prog)s [-h] [OPTION ...] RUN | LOGS [KEY=VALUE ...]"
     parser.add_argument(
         "--reward",
         metavar="NAME | FILE",
@@ -83,9 +79,6 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def _analyze(args: argparse.Namespace) -> int:
-    if (drive := drive_given(args)) is not None:
-        return _analyze_drive(args, *drive)
-
     from deepracer_exp.analysis.line_file import check_line_file
 
     target_s = None if args.target is None else _seconds(args.target)
@@ -184,31 +177,6 @@ def _write_laps_asked_for(args: argparse.Namespace, view: "LogView", episode: in
         with writing(f"--line {args.line}"):
             write_line(Path(args.line), line[0])
         print(f"  line  {args.line} ({line[1]})")
-
-
-def _analyze_drive(args: argparse.Namespace, place: Path, run: str | None, overrides: list[str]) -> int:
-    """Write the page of a physical car's drive."""
-    for flag in ("reward", "target", "replay", "line", "lap", "fastest", "track"):
-        if getattr(args, flag) not in (None, False):
-            raise BadInput(
-                f"--{flag}", f"{place} is the log of a car, which has no laps", "runs and other logs"
-            )
-    check_file("--output", args.output)
-    log, policy = read_drive(place, run, overrides)
-
-    from deepracer_exp.analysis.car_drive import headline
-    from deepracer_exp.reports.car_drive import write_drive_page
-
-    out = Path(args.output or page_name("analysis", log.name))
-    with writing(f"--output {out}", "a file in a folder"):
-        sentences = write_drive_page(out, log, policy)
-    print(f"{log.name}: {headline(log)}")
-    for number, sentence in enumerate(sentences, 1):
-        print(f"{number:3d}  {sentence}")
-    for problem in log.problems:
-        print(f"     {problem}")
-    end_with_page(out, args.open)
-    return 0
 
 
 def _car(config: dict[str, Any]) -> "CarConfig":

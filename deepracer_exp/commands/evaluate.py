@@ -11,7 +11,7 @@ from deepracer_exp.errors import BadInput
 
 from .arguments import add_command, add_run, port, run_and_overrides, runs_and_overrides, split_stores
 from .output import check_file, plain_console, table_console, warnings_on_stderr
-from .pages import add_replay, drive_given, page_name, read_drive, write_laps
+from .pages import add_replay, write_laps
 
 if TYPE_CHECKING:
     from deepracer_exp.evaluation.plan import EvaluatePlan
@@ -93,7 +93,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     )
     add_run(parser, "checkpoint=NAME | evaluation=NAME | KEY=VALUE", many=True)
     parser.usage = (
-        "%(prog)s [-h] [-o FILE] [--live] [--port PORT] [--replay PAGE.html] RUN | DRIVE [RUN | LOGS] "
+        "%(prog)s [-h] [-o FILE] [--live] [--port PORT] [--replay PAGE.html] RUN [RUN | LOGS] "
         "[KEY=VALUE ...]"
     )
     parser.add_argument(
@@ -213,16 +213,12 @@ _WATCH_EPILOG = """\
   deepracer-exp watch RUN --live                            a page that follows the training
   deepracer-exp watch RUN --replay laps.html                a page: its fastest usual lap beside an ordinary one
   deepracer-exp watch RUN RUN --replay laps.html            or beside the fastest lap of another run, or of logs
-  deepracer-exp watch my_model-20261126-101500              film a physical car's drive from its log (a ROS bag)
-  deepracer-exp watch my_model-20261126-101500 RUN          and what RUN's policy would have done, and where it looks
 
 The page shows the laps that the training evaluates its policy by; evaluation=NAME shows others.
 """
 
 
 def _watch(args: argparse.Namespace) -> int:
-    if (drive := drive_given(args)) is not None:
-        return _film_drive(args, *drive)
     chosen = [*_checkpoints_given(args), *[f"--output {args.output}"] * (args.output is not None)]
     if args.live and chosen:
         raise BadInput(
@@ -264,22 +260,6 @@ def _watch(args: argparse.Namespace) -> int:
 
         used = Budget(plan.run.experiment.budget, plan.run.path).used
         serve_live(plan.run, plan.config.evaluation, server, used)
-    return 0
-
-
-def _film_drive(args: argparse.Namespace, place: Path, run: str | None, overrides: list[str]) -> int:
-    """Film a physical car's drive."""
-    for flag in ("live", "port", "replay"):
-        if getattr(args, flag):
-            raise BadInput(f"--{flag}", f"{place} is the log of a car's drive", "a run")
-    check_file("--output", args.output, ".mp4")
-    log, policy = read_drive(place, run, overrides)
-
-    from deepracer_exp.reports.car_film import film_drive
-
-    file = Path(args.output or page_name("drive", log.name).with_suffix(".mp4"))
-    film_drive(file, log, policy, plain_console(stderr=True))
-    print(f"  film  {file}")
     return 0
 
 

@@ -10,15 +10,13 @@ from deepracer_exp.errors import BadInput, reading, writing
 from deepracer_exp.files import LOG_BYTES, open_user_file
 from deepracer_exp.runs.files import is_run
 
-from .arguments import Stores, read_stores, runs_and_overrides
+from .arguments import Stores
 
 if TYPE_CHECKING:
     from deepracer_exp.analysis.charts.figure import Chart
     from deepracer_exp.analysis.log_tables import Table
     from deepracer_exp.analysis.log_view import LogView
-    from deepracer_exp.aws.logs.car_log import CarLog
     from deepracer_exp.lookup.resolve import StoredRun
-    from deepracer_exp.reports.car_drive import DrivenPolicy
     from deepracer_exp.reports.lap_replay import ReplayedLap
 
 _ACCEPTED = "logs of the service, or a run"
@@ -105,54 +103,6 @@ def find_run(what: str, stores: Stores) -> "StoredRun":
         return stores.find(what)
     except BadInput as error:
         raise BadInput(what, f"no such file or folder, and no run: {error.without(what)}") from None
-
-
-def drive_given(args: argparse.Namespace) -> tuple[Path, str | None, list[str]] | None:
-    """Return the log of a physical car's drive that a command was given, a run beside it, and the overrides.
-
-    None: it was given something else.
-
-    Raises:
-        BadInput: there is more than one run beside it.
-    """
-    from deepracer_exp.aws.logs.car_log import is_car_log
-
-    words, overrides = runs_and_overrides(args)
-    if not words or not words[0].strip():
-        return None
-    with reading(words[0], _ACCEPTED):
-        place = Path(words[0]).expanduser()
-    if not is_car_log(place):
-        return None
-    if len(words) > 2:
-        raise BadInput(f"{' '.join(words)}: {len(words)} given; accepted: the log of a drive, and a run")
-    return place, words[1] if words[1:] else None, overrides
-
-
-def read_drive(
-    place: Path, run: str | None, overrides: Sequence[str]
-) -> "tuple[CarLog, DrivenPolicy | None]":
-    """Read the log of a physical car's drive, and the policy of the run that is to decide on its pictures.
-
-    Raises:
-        BadInput: one of them cannot be used.
-    """
-    from deepracer_exp.aws.logs.car_log import read_car_log
-
-    stores = read_stores(overrides, ["checkpoint"])
-    stored = None if run is None else stores.find(run).with_policy(stores.values.get("checkpoint"))
-    if stored is None and "checkpoint" in stores.values:
-        raise BadInput("checkpoint", "of which run?", "beside the log of a drive and a run")
-    log = read_car_log(place)
-    if stored is None:
-        return log, None
-
-    import torch
-
-    from deepracer_exp.reports.car_drive import DrivenPolicy
-
-    torch.set_num_threads(1)
-    return log, DrivenPolicy(stored)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ import pandas as pd
 from deepracer_exp.aws.archives import natural
 from deepracer_exp.errors import BadInput
 
-from .car_log import is_car_log
 from .drives import (
     Drives,
     Rows,
@@ -65,12 +64,6 @@ def read_recording(path: Path) -> Recording:
     name = PACKED.sub("", named_parts(path)[-1])
     recording = _Assembly(parts).recording(readable(name))
     if not (len(recording.steps) or len(recording.updates) or len(recording.metrics)):
-        if is_car_log(path):
-            raise BadInput(
-                path,
-                "is the log of a physical car: no positions, no laps",
-                "by deepracer-exp analyze and watch",
-            )
         why = f" ({recording.problems[0]})" if recording.problems else ""
         raise BadInput(path, f"no recorded steps{why}", "trace CSVs or logs of the service")
     return recording
