@@ -93,8 +93,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     )
     add_run(parser, "checkpoint=NAME | evaluation=NAME | KEY=VALUE", many=True)
     parser.usage = (
-        "%(prog)s [-h] [-o FILE] [--live] [--port PORT] [--replay PAGE.html] RUN [RUN | LOGS] "
-        "[KEY=VALUE ...]"
+        "%(prog)s [-h] [-o FILE] [--live] [--port PORT] [--replay PAGE.html] RUN [RUN | LOGS] [KEY=VALUE ...]"
     )
     parser.add_argument(
         *("-o", "--output"), metavar="FILE", help="film to write (.mp4; default: films/ in the run's folder)"

@@ -62,13 +62,13 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         commands,
         "export",
         _export,
-        help="write a trained policy, its training files or its logs for other programs",
-        description="Write a run's policy as ONNX or for a physical car, the files that AWS's console and "
-        "deepracer-for-cloud train from, or its logs in the format of these two.",
+        help="write a trained policy or its training files for other programs",
+        description="Write a run's policy as ONNX or for a physical car, or the files that AWS's console and "
+        "deepracer-for-cloud train from.",
         epilog=_EXPORT_EPILOG,
         entry=None,
     )
-    add_run(parser, "format=onnx|aws|aws-model|aws-logs|car | KEY=VALUE")
+    add_run(parser, "format=onnx|aws|aws-model|car | KEY=VALUE")
     parser.add_argument(
         "-o", "--output", help="file or folder to write (default: in the run's folder, export/)"
     )
@@ -134,11 +134,7 @@ def _import_model(args: argparse.Namespace) -> int:
     return 0
 
 
-_EXPORTED = {
-    "format": ("onnx", "car", "aws", "aws-model", "aws-logs"),
-    "layout": ("console", "deepracer-for-cloud"),
-}
-"""Accepted values of the keys of `export`."""
+_FORMATS = ("onnx", "car", "aws", "aws-model")
 _EXPORT_EPILOG = """\
   deepracer-exp export RUN format=onnx                      the network as one file, checked against itself
   deepracer-exp export RUN format=onnx checkpoint=last -o policy.onnx
@@ -147,9 +143,6 @@ _EXPORT_EPILOG = """\
                                                             hyperparameters.json
   deepracer-exp export RUN format=aws-model -o my_model     these and the weights: a pretrained model for
                                                             deepracer-for-cloud and deepracer-on-aws
-  deepracer-exp export RUN format=aws-logs                  trace, metrics and logs of the training, as in an archive
-                                                            of the AWS console (deepracer-utils reads it)
-  deepracer-exp export RUN format=aws-logs layout=deepracer-for-cloud
   deepracer-exp export RUN format=car -o my_model.tar.gz    for the console of a physical car, which calls it my_model;
                                                             needs a policy that sees with the camera
 """
@@ -159,21 +152,20 @@ def _export(args: argparse.Namespace) -> int:
     from deepracer_exp.config.own_class import allow_given
 
     name, overrides = run_and_overrides(args)
-    stores = read_stores(allow_given(overrides), [*_EXPORTED, "checkpoint", "debug"])
-    if "format" not in stores.values:
+    stores = read_stores(allow_given(overrides), ["format", "checkpoint", "debug"])
+    format = stores.values.get("format")
+    if format is None:
         raise BadInput(
             "format",
-            "missing; write format=onnx, format=aws, format=aws-model, format=aws-logs, or, for a policy that sees "
-            "with the camera, format=car",
+            "missing; write format=onnx, format=aws, format=aws-model, or, for a policy that sees with the "
+            "camera, format=car",
         )
-    chosen = {key: stores.values.get(key, accepted[0]) for key, accepted in _EXPORTED.items()}
-    for key, value in chosen.items():
-        if value not in _EXPORTED[key]:
-            raise BadInput(f"{key}={value}", f"no such {key}", ", ".join(_EXPORTED[key]))
+    if format not in _FORMATS:
+        raise BadInput(f"format={format}", "no such format", ", ".join(_FORMATS))
     run = stores.find(name)
-    if chosen["format"] in ("onnx", "car", "aws-model"):
+    if format in ("onnx", "car", "aws-model"):
         run = run.with_policy(stores.values.get("checkpoint"))
-    if chosen["format"] == "car":
+    if format == "car":
         from deepracer_exp.env.real_car import check_car
 
         check_car(run.experiment)
@@ -181,7 +173,7 @@ def _export(args: argparse.Namespace) -> int:
     from deepracer_exp.export.export import export
 
     with warnings_on_stderr():
-        export(run, **chosen, output=args.output, out=plain_console())
+        export(run, format, args.output, plain_console())
     return 0
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tensordict import TensorDict
 
-from deepracer_exp.aws.logs.writer import write_evaluation_trace
+from deepracer_exp.aws.logs.sim_trace import write_trace
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.env.placement import placements_table
 from deepracer_exp.env.race import Race
@@ -56,7 +56,8 @@ class TraceRecorder:
         )
         with writing(folder, failure=RunFailed):
             folder.mkdir(parents=True, exist_ok=True)
-            files = [write_evaluation_trace(table, folder)]
+            files = [folder / "evaluation-simtrace" / "0-iteration.csv"]
+            write_trace(table, files[0])
             if extra.shape[1]:
                 assert race.setup.others is not None
                 placed = placements_table(race.setup, rows, extra)

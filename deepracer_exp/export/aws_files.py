@@ -24,7 +24,7 @@ from deepracer_exp.validation.aws_rules import text_findings
 from .written import Written, reward_text, write_files
 
 
-def export_files(run: StoredRun, _: str, folder: Path) -> Written:
+def export_files(run: StoredRun, folder: Path) -> Written:
     """Write the files that a training on AWS starts from; arguments, result and errors as for `export.Writer`."""
     reward = reward_text(run)
     texts, notes = aws_files(run.experiment, reward)

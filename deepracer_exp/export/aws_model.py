@@ -35,7 +35,7 @@ _PIXELS = 160, 120
 _LAYERS = ("filters", "kernels", "strides", "hidden", "lidar_hidden")
 
 
-def export_model(run: StoredRun, _: str, folder: Path) -> Written:
+def export_model(run: StoredRun, folder: Path) -> Written:
     """Write a pretrained model of the service; arguments, result and errors as for `export.Writer`."""
     stored = run.read_policy()
     result = read_result(run.path)

@@ -56,7 +56,7 @@ class CarArchive(NamedTuple):
     """One for each change, and for each thing that the car does differently."""
 
 
-def export_car(run: StoredRun, _: str, path: Path) -> Written:
+def export_car(run: StoredRun, path: Path) -> Written:
     """Write the archive of a policy for a physical car; arguments, result and errors as for `export.Writer`."""
     if not path.name.endswith(ENDING) or path.is_dir():
         raise BadInput(

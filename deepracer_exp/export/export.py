@@ -1,4 +1,4 @@
-"""The command `export`: a policy as ONNX, for a car or as a model of the service; a run's files or logs for AWS."""
+"""The command `export`: a policy as ONNX, for a car or as a model of the service; a run's files for AWS."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -9,14 +9,13 @@ from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.files import EXPORTS
 
 from .aws_files import export_files
-from .aws_logs import export_logs
 from .aws_model import export_model
 from .car_archive import export_car, name_in_exports
 from .onnx import export_onnx
 from .written import Written
 
-Writer = Callable[[StoredRun, str, Path], Written]
-"""Writes a run, in a folder layout where the format has several, to a file or a folder.
+Writer = Callable[[StoredRun, Path], Written]
+"""Writes a run to a file or a folder.
 
 Raises BadInput where the checkpoint or the output cannot be used, or a package is missing; RunFailed where the written
 file differs from the network.
@@ -26,16 +25,15 @@ WRITERS: Mapping[str, tuple[Writer, Callable[[StoredRun], str]]] = {
     "car": (export_car, name_in_exports),
     "aws": (export_files, lambda run: "aws"),
     "aws-model": (export_model, lambda run: "aws-model"),
-    "aws-logs": (export_logs, lambda run: "aws-logs"),
 }
 """The writer of each format, and what it writes into the run's folder of exports where no output is given."""
 
 
-def export(run: StoredRun, format: str, layout: str, output: str | None, out: Console) -> Path:
+def export(run: StoredRun, format: str, output: str | None, out: Console) -> Path:
     """Export a run in a format and print what was written; errors as for `Writer`."""
     write, name = WRITERS[format]
     path = Path(output or run.path / EXPORTS / name(run))
-    files, lines = write(run, layout, path)
+    files, lines = write(run, path)
     for line in (*map(str, files), *(f"  {line}" for line in lines)):
         out.print(line, soft_wrap=True)
     return path

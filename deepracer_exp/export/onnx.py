@@ -28,7 +28,7 @@ TOLERANCE = 1e-4
 """Largest accepted difference, with a margin over single-precision rounding."""
 
 
-def export_onnx(run: StoredRun, _: str, path: Path) -> Written:
+def export_onnx(run: StoredRun, path: Path) -> Written:
     """Write the policy of a run as an ONNX file; arguments, result and errors as for `export.Writer`."""
     if path.is_dir():
         raise BadInput(f"--output {path}", f"is a folder; give a file, e.g. {path / 'policy.onnx'}")

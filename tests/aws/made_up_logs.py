@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from deepracer_exp.aws.logs.recording import Recording
+from deepracer_exp.runs.recording import read_run_recording
 
 COMMON = (
     *("episode", "steps", "X", "Y", "yaw", "steer", "throttle", "action", "reward", "done"),
@@ -272,3 +273,12 @@ def add_member(archive: tarfile.TarFile, name: str, raw: bytes) -> None:
 def training(recording: Recording) -> pd.DataFrame:
     """Return the steps of the training."""
     return recording.steps[recording.steps["stream"] == "training"]
+
+
+def write_run_as_logs(run_dir: Path, folder: Path, world: str) -> Path:
+    """Write the whole episodes of a run of ours with discrete actions as one training log of the service."""
+    steps = read_run_recording(run_dir).recording.steps.sort_values(["episode", "steps"])
+    steps = steps[steps.groupby("episode")["done"].transform("any")].astype({"action": int})
+    folder.mkdir(parents=True)
+    (folder / "training-robomaker.log").write_text(log_text(steps, world=world))
+    return folder

@@ -13,6 +13,7 @@ from deepracer_exp.commands.tracks import experiment_on
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.action_space import build_action_space, describe_actions
 from deepracer_exp.fastest.lap import COLUMNS, FastestLap, Question, _keep
+from tests.aws.made_up_logs import write_run_as_logs
 
 LAPS = ("track=Straight_track", "action_space=deepracer", "reward=speed_on_track", "budget.env_steps=16384")
 
@@ -25,10 +26,10 @@ def run_dir(copied) -> Path:
 
 @pytest.fixture
 def logs(run_dir, call, tmp_path) -> Path:
-    """Its logs, as the console writes them."""
-    ended = call("export", str(run_dir), "format=aws-logs", "-o", str(tmp_path / "from aws"))
-    assert ended.code == 0, ended.stderr
-    return tmp_path / "from aws"
+    """Its logs, as the service writes them, and the file of its actions."""
+    folder = write_run_as_logs(run_dir, tmp_path / "from aws", "Straight_track")
+    assert call("export", str(run_dir), "format=aws", "-o", str(folder)).code == 0
+    return folder
 
 
 def described(*overrides: str) -> str:

@@ -61,9 +61,9 @@ def test_runs_are_found_as_by_other_commands(run_dir, call, monkeypatch, what):
     assert [(ended.cwd / place).resolve() for place in found] == [run_dir.resolve()]
 
 
-def test_logs_from_elsewhere_have_their_page_in_the_current_folder(run_dir, call, tmp_path):
-    exported = call("export", str(run_dir), "format=aws-logs", "-o", str(tmp_path / "from aws"))
-    assert exported.code == 0, exported.stderr
+def test_logs_from_elsewhere_have_their_page_in_the_current_folder(call, tmp_path):
+    (tmp_path / "from aws").mkdir()
+    (tmp_path / "from aws" / "training-robomaker.log").write_text(log_text(drives([0, 1])))
     ended = call("analyze", "from aws")
     assert ended.code == 0, ended.stderr
     assert "from-aws-analysis.html" in ended.stdout
@@ -102,10 +102,9 @@ def test_another_reward_function_is_replayed_and_the_page_opened(run_dir, call, 
 
 
 def test_code_from_elsewhere_is_not_run(run_dir, call, tmp_path):
-    call("export", str(run_dir), "format=aws-logs", "-o", str(tmp_path / "theirs"))
+    (tmp_path / "theirs").mkdir()
+    (tmp_path / "theirs" / "training-robomaker.log").write_text(log_text(drives([0, 1])))
     trap = f"open({str(tmp_path / 'trapped')!r}, 'w')\ndef terms(params): return {{}}\n"
-    for file in (tmp_path / "theirs").rglob("reward_function.py"):
-        file.write_text(trap)
     (tmp_path / "theirs" / "reward_function.py").write_text(trap)
     shutil.copytree(run_dir, tmp_path / "their_run")
     (tmp_path / "their_run" / "reward_function.py").write_text(trap)

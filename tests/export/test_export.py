@@ -38,13 +38,13 @@ def test_what_the_console_would_refuse_of_a_reward_is_reported(trained, call, tm
         (["format=onnx"], "RUN: missing"),
         (
             ["nowhere"],
-            "format: missing; write format=onnx, format=aws, format=aws-model, format=aws-logs, or, for a policy that "
-            "sees with the camera, format=car",
+            "format: missing; write format=onnx, format=aws, format=aws-model, or, for a policy that sees with the "
+            "camera, format=car",
         ),
         (["nowhere", "format=onnx"], "nowhere: no such run"),
         (
             ["nowhere", "format=coreml"],
-            "format=coreml: no such format; accepted: onnx, car, aws, aws-model, aws-logs",
+            "format=coreml: no such format; accepted: onnx, car, aws, aws-model",
         ),
         (
             ["nowhere", "format=onnx", "chekpoint=last"],

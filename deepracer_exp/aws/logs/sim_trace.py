@@ -5,9 +5,11 @@ import re
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
@@ -376,3 +378,15 @@ def _number(text: str) -> float | None:
 
 def _text(raw: bytes) -> str:
     return raw.decode("utf-8", "replace").strip()
+
+
+def write_trace(steps: pd.DataFrame, file: Path) -> None:
+    """Write steps, with the columns of a trace of ours, as a CSV of the service of 2022, and its folder."""
+    table = steps[list(LOG_LAYOUTS[17])].astype({"steps": np.float64})
+    if steps["action"].isna().any():  # of a continuous action space, as the service has it
+        commands = zip(steps["steer"].tolist(), steps["throttle"].tolist(), strict=True)
+        table["action"] = [f"[{steering_deg} {speed_mps}]" for steering_deg, speed_mps in commands]
+    else:
+        table["action"] = table["action"].astype(np.int64)
+    file.parent.mkdir()
+    table.to_csv(file, index=False)
