@@ -5,12 +5,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from deepracer_exp.errors import BadInput, count, writing
-from deepracer_exp.runs.files import CONFIG, TRACE, is_run
+from deepracer_exp.errors import BadInput, count
+from deepracer_exp.runs.files import CONFIG, is_run
 
 from .arguments import STORES, Stores, add_command, add_run, read_stores, runs_and_overrides
 from .compare_runs import compare_runs
-from .output import check_file, plain_console, print_table, table_console, warnings_on_stderr
+from .output import check_file, print_table, table_console
 from .pages import (
     Item,
     add_page,
@@ -19,7 +19,6 @@ from .pages import (
     existing_logs,
     find_run,
     light,
-    page_name,
     write_comparison_page,
     write_laps,
 )
@@ -33,7 +32,6 @@ _EPILOG = """\
                                                             in their seed and track are a group
   deepracer-exp compare before after                        two experiments
   deepracer-exp compare old=RUN,RUN,RUN new=RUN,RUN,RUN     groups of your own
-  deepracer-exp compare RUN ~/Downloads/evaluation.tar.gz   our laps beside those of the service's evaluation
   deepracer-exp compare RUN logs/ logs2/ --open             how runs and logs learned; open the page
   deepracer-exp compare RUN RUN --replay laps.html          their fastest laps, driven beside each other
   deepracer-exp compare season --format csv > curves.csv    the learning curves over seeds
@@ -42,8 +40,7 @@ Compared are the evaluated policies of the best checkpoints: their lap, completi
 curves, as interquartile means over seeds with 95% bootstrap intervals. A difference that seeds explain is called that;
 it takes at least four runs of each group on a track to show one.
 
-LOGS is a folder, an archive or a file of any layout, as `deepracer-exp analyze` takes. With one run and one log the
-policy races on the log's track, in its direction, from the same starts, as many laps in a row.
+LOGS is a folder, an archive or a file of any layout, as `deepracer-exp analyze` takes.
 """
 
 
@@ -61,7 +58,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     )
     add_run(
         parser,
-        f"GROUP=RUN,RUN,... | checkpoint=NAME | {' | '.join(f'{key}=...' for key in STORES)}",
+        f"GROUP=RUN,RUN,... | {' | '.join(f'{key}=...' for key in STORES)}",
         many=True,
     )
     parser.usage = (
@@ -82,10 +79,9 @@ def _compare(args: argparse.Namespace) -> int:
     from deepracer_exp.config.own_class import allow_given
 
     words, pairs = runs_and_overrides(args)
-    keys = (*STORES, "checkpoint")
-    overrides = [pair for pair in pairs if (key := pair.partition("=")[0]) in keys or "." in key]
+    overrides = [pair for pair in pairs if (key := pair.partition("=")[0]) in STORES or "." in key]
     groups = [pair for pair in pairs if pair not in overrides]
-    stores = read_stores(allow_given(overrides), ["checkpoint"])
+    stores = read_stores(allow_given(overrides))
     check_file("--output", args.output)
     check_file("--replay", args.replay, ".html")
     items = [_item(word, None, stores) for word in words]
@@ -104,12 +100,6 @@ def _compare(args: argparse.Namespace) -> int:
         raise BadInput(f"--replay {args.replay}: {len(runs) + len(logs)} runs and logs given; accepted: two")
     if logs and args.format != "table":
         raise BadInput(f"--format {args.format}: accepted with runs only; {logs[0].word} is a log")
-    one_of_each = len(runs) == len(logs) == 1
-    if "checkpoint" in stores.values and not one_of_each:
-        raise BadInput(f"checkpoint={stores.values['checkpoint']}: accepted with one run and one log")
-    if one_of_each:
-        (item,) = (item for item in items if not item.is_logs)
-        return _against_log(args, item, logs[0].paths[0], stores.values.get("checkpoint"))
     return _compare_recordings(args, items) if logs else compare_runs(args, items)
 
 
@@ -125,8 +115,7 @@ def _item(word: str, group: str | None, stores: Stores) -> Item:
                 return Item(word, group, tuple(members), True)
         if path is not None:
             return Item(word, group, (path,))
-    run = find_run(word, stores)
-    return Item(word, group, (run.path,), run=run)
+    return Item(word, group, (find_run(word, stores).path,))
 
 
 def _compare_recordings(args: argparse.Namespace, items: Sequence[Item]) -> int:
@@ -170,44 +159,4 @@ def _compare_recordings(args: argparse.Namespace, items: Sequence[Item]) -> int:
     end_with_page(out, args.open)
     if args.replay is not None:
         print(f"  laps  {args.replay}")
-    return 0
-
-
-def _against_log(args: argparse.Namespace, item: Item, place: Path, checkpoint: str | None) -> int:
-    """Race a policy as the laps of a log were driven; draw how both learned where the log has a training."""
-    from deepracer_exp.lookup.resolve import StoredRun
-
-    run = (item.run or StoredRun(item.paths[0])).with_policy(checkpoint)
-
-    from deepracer_exp.analysis.charts.runs import recordings_compared
-    from deepracer_exp.analysis.log_view import prepare, prepare_races
-    from deepracer_exp.aws.logs.reader import read_recording
-    from deepracer_exp.reports.against_log import write_against_log
-    from deepracer_exp.reports.lap_replay import laps_of_log
-    from deepracer_exp.runs.recording import read_log
-
-    recording = read_recording(place)
-    view = prepare_races(recording, args.track)
-
-    from deepracer_exp.reports.driven_against_log import race_against_log
-
-    with warnings_on_stderr():
-        both = race_against_log(run, view, args.track, plain_console(stderr=True))
-    learned = None
-    if (run.path / TRACE).is_dir() and (args.replay is not None or prepare(recording, args.track).trained):
-        views = [prepare(read_log(run.path)), prepare(recording, args.track)]
-        learned = recordings_compared([(None, light(side)) for side in views])
-        if args.replay is not None:
-            write_laps(args.replay, laps_of_log(*views))
-    out = Path(args.output or page_name("comparison", view.name))
-    with writing(f"--output {out}", "a file in a folder"):
-        write_against_log(out, run.path.name, both, view, learned)
-
-    console, texts = table_console(), both.texts
-    console.print(f"log        {view.name}: {both.logged.words}", soft_wrap=True)
-    console.print(f"simulated  {run.path.name}: {both.simulated.words}\n", soft_wrap=True)
-    print_table(console, None, texts)
-    for sentence in both.sentences:
-        console.print(sentence, soft_wrap=not console.is_terminal)
-    end_with_page(out, args.open)
     return 0

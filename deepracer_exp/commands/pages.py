@@ -115,8 +115,6 @@ class Item:
     paths: tuple[Path, ...]
     """Folders of runs, or one file or folder of logs."""
     is_experiment: bool = False
-    run: "StoredRun | None" = None
-    """The run, if the word names one, with the checkpoint of an alias."""
 
     @property
     def is_logs(self) -> bool:

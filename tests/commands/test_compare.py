@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.analysis.made_up_runs import made_up_run, made_up_seeds
+from tests.aws.made_up_logs import write_run_as_logs
 from tests.page_html import Html
 
 LAPS = ("track=Straight_track", "action_space=deepracer", "reward=progress_delta", "budget.env_steps=16384")
@@ -22,9 +23,9 @@ def run_dir(copied) -> Path:
 
 
 @pytest.fixture
-def logs(run_dir, call, tmp_path) -> str:
+def logs(run_dir, tmp_path) -> str:
     """The run as logs of the service."""
-    assert call("export", str(run_dir), "format=aws-logs", "-o", str(tmp_path / "from aws")).code == 0
+    write_run_as_logs(run_dir, tmp_path / "from aws", "Straight_track")
     return "from aws"
 
 
@@ -123,22 +124,6 @@ def test_the_curves_are_exported(study, call):
         "algorithm.lr=1e-3",
     }
     assert not list(ended.cwd.glob("*.html"))
-
-
-def test_simulated_laps_stand_beside_those_of_logs(run_dir, logs, call, tmp_path):
-    ended = call("compare", str(run_dir), logs, "checkpoint=last", "--replay", "laps.html")
-    assert ended.code == 0, ended.stderr
-    page = page_of(tmp_path / "from-aws-comparison.html")
-    figures = ("lines_compared", "along_the_track", "actions_compared", "recordings_compared")
-    assert {f"figure-{name}" for name in figures} <= set(page.ids)
-    assert "of the training, which explores" in ended.stdout
-    said = ended.stdout.splitlines()
-    for line in (*said[4:8], said[-3]):
-        assert " ".join(line.split()) in page.text
-    assert not page.loads
-    assert (tmp_path / "laps.html").is_file()
-    # Which comes first decides nothing.
-    assert call("compare", logs, str(run_dir)).code == 0
 
 
 def test_logs_are_compared_by_what_analyze_says_of_each(call, reference, tmp_path):
