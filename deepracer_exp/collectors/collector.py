@@ -1,4 +1,4 @@
-"""Batches of driving, from cars in this process, in several, or on a Ray cluster."""
+"""Batches of driving, from cars in this process or in several."""
 
 import contextlib
 import functools
@@ -357,10 +357,6 @@ def open_collector(
         RunFailed: a worker did not start.
     """
     frames = frames_per_batch(config, algorithm)
-    if config.mode == "ray":
-        from .ray_collector import RayCollector
-
-        return RayCollector(config, setup, policy, frames, run_dir, state, rivals)
     return LocalCollector(config, setup, policy, frames, run_dir, state, rivals)
 
 

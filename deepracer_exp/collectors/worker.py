@@ -79,11 +79,7 @@ class EnvFactory:
     rivals: Rivals | None = None
     """What the cars race against; None: they are alone."""
     heartbeat: Path | None = None
-    """File of the counted steps; None if the environment does not live in a worker process of this machine."""
-    prints: RewardPrints | None = None
-    """Where the output of reward functions goes; None for the file in the run's folder."""
-    on_step: Callable[[], None] | None = None
-    """Called after every step; a worker process counts its own in `heartbeat` instead."""
+    """File of the counted steps; None if the environment does not live in a worker process."""
 
     def __call__(self) -> RaceEnv:
         """Return the environment, with the process around it made ready."""
@@ -94,7 +90,7 @@ class EnvFactory:
             end_with_owner()
         race = self._race()
         if self.heartbeat is None:
-            return _StateKeepingEnv(race, self.rivals, self.on_step)
+            return _StateKeepingEnv(race, self.rivals, None)
         beats, worker = np.memmap(self.heartbeat, np.int64, "r+"), self.worker
         beats[worker] = 0
 
@@ -113,7 +109,7 @@ class EnvFactory:
         options: dict[str, Any] = {
             "threads": self.threads,
             "first_car": self.worker * self.n_cars,
-            "prints": self.prints or RewardPrints(self.run_dir / REWARD_PRINTS),
+            "prints": RewardPrints(self.run_dir / REWARD_PRINTS),
         }
         if self.rivals is None:
             return Race(self.setup, self.n_cars, **options)

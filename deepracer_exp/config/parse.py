@@ -82,10 +82,6 @@ def _check_combinations(experiment: Experiment) -> None:
             f"collector.processes={collector.processes} with collector.cars={collector.cars}: every process has as "
             f"many cars as the others, at least 4; accepted: {', '.join(map(str, near))}"
         )
-    if collector.mode == "ray" and collector.processes is None:
-        raise BadInput(
-            "collector.processes=null with collector=ray: the size of a cluster changes; give the number of processes"
-        )
     limit_s, hang_s = experiment.reward.time_limit_s, collector.hang_timeout_s
     if collector.mode != "in_process" and limit_s >= hang_s:
         raise BadInput(

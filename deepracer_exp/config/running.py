@@ -18,7 +18,7 @@ _FEWEST_CARS = 4
 class CollectorConfig:
     """Where experience is collected."""
 
-    mode: Literal["in_process", "sync", "ray"]
+    mode: Literal["in_process", "sync"]
     processes: UpTo1000 | None
     cars: Annotated[int, Field(ge=1, le=100_000)]
     threads: Annotated[int, Field(ge=0, le=1024)]

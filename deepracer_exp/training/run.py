@@ -17,7 +17,6 @@ import torch
 from rich.console import Console
 
 from deepracer_exp.agents.actor_critic import PolicyNetworks
-from deepracer_exp.collectors.ray_cluster import check_collector
 from deepracer_exp.config import acting
 from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.experiment import Experiment
@@ -169,7 +168,6 @@ def _try(experiment: Experiment, setup: RaceSetup) -> None:
     RewardFunction(setup.reward, 1, setup.reward_time_limit_s, None)
     with reading(f"car {experiment.car.name}", "dimensions, masses and settings of a car that can stand"):
         CarBatch(setup.car, 1, 1)
-    check_collector(experiment.collector)
     gpus = torch.cuda.device_count()
     if experiment.device != "cpu" and (torch.device(experiment.device).index or 0) >= gpus:
         names = ["cpu", *(f"cuda:{number}" for number in range(gpus))]

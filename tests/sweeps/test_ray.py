@@ -1,6 +1,5 @@
-"""Sweeps and collectors on a local Ray cluster of two nodes; of its processes none listens beyond this machine."""
+"""Sweeps on a local Ray cluster of two nodes; of its processes none listens beyond this machine."""
 
-import functools
 import importlib.util
 import shutil
 import signal
@@ -10,9 +9,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from benchmarks.same import different_rows
 from deepracer_exp.errors import BadInput
-from deepracer_exp.runs.files import read_metrics, read_object
 from deepracer_exp.sweeps.queue.ray_launcher import refuse_files
 from deepracer_exp.tracking.store import Store
 
@@ -21,7 +18,6 @@ from ..faults.test_killed_sweeps import SWEEP, assert_every_trial_is_accounted_f
 """Longer than that of other tests: three processes import PyTorch one after the other."""
 _MEMORY = 80 * 2**20
 """Bytes of shared memory a node has for objects."""
-_TINY = ("train", "experiment=tiny", "tracking=off", "collector.processes=2", "report=false")
 
 
 class TwoNodes:
@@ -131,51 +127,14 @@ def known(cwd):
     return (cwd / "runs" / "sweeps.db").exists()
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("two_nodes")
-def test_cars_on_a_cluster_drive_as_those_of_processes_on_one_machine(run_at, call, tmp_path):
-    folders = []
-    # The first one in a process of its own: this one may have imported Ray before its variables were set.
-    for collector, run in (("ray", functools.partial(run_at, tmp_path)), ("sync", call)):
-        ended = run(*_TINY, f"collector={collector}", f"name={collector}")
-        assert ended.code == 0, ended.stderr
-        folders += (tmp_path / "runs" / collector).iterdir()
-    on_cluster, here = (read_metrics(folder / "metrics.jsonl") for folder in folders)
-    assert different_rows(on_cluster, here) is None
-
-
-@pytest.mark.slow
-def test_prints_and_errors_of_a_remote_reward_function_are_in_the_run_folder(two_nodes, run_at, tmp_path):
-    two_nodes.second()
-    (tmp_path / "mine.py").write_text(
-        "def reward_function(params):\n"
-        "    if params['steps'] == 3:\n        print('third')\n"
-        "    return 1.0 if params['steps'] < 40 else params['no_such_parameter']\n"
-    )
-    ended = run_at(tmp_path, *_TINY, "collector=ray", "reward.file=mine.py")
-    ended.assert_run_failed("no_such_parameter")
-    assert "third" in (ended.folder / "reward_prints.log").read_text()
-    (fault, *_) = ended.folder.glob("faults/worker-*.json")
-    assert read_object(fault)["params"]["steps"] >= 40
-
-
-@pytest.mark.slow
-def test_a_killed_remote_collector_is_named(two_nodes, start, tmp_path):
-    two_nodes.second()
-    running = start(*_TINY, "collector=ray", "budget.env_steps=100000000")
-    running.wait_for(lambda: list(tmp_path.glob("runs/*/*/metrics.jsonl")), "iteration")
-    next(
-        one for one in psutil.process_iter(["cmdline"]) if "ray::Cars" in " ".join(one.info["cmdline"] or ())
-    ).kill()
-    running.end(240).assert_run_failed("collector worker", "is lost")
-
-
 def test_without_ray_the_extra_is_named(call, monkeypatch):
     found = importlib.util.find_spec
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name, *more: None if name == "ray" else found(name, *more)
     )
-    call(*_TINY, "collector=ray").assert_bad_input("collector=ray", "pip install 'deepracer-exp[ray]'")
+    call(*SWEEP, "sweep/executor=ray").assert_bad_input(
+        "sweep/executor=ray", "pip install 'deepracer-exp[ray]'"
+    )
 
 
 def test_a_cluster_that_does_not_answer_is_refused_before_anything_is_made(call, monkeypatch):
@@ -191,13 +150,6 @@ def test_a_cluster_without_room_is_refused(two_nodes, run_at, tmp_path):
     more = "sweep.executor.cpus_per_worker=64"
     ended = run_at(tmp_path, *SWEEP, "sweep/executor=ray", more)
     ended.assert_bad_input("no node of the Ray cluster has that many", more)
-    ended = run_at(tmp_path, *_TINY, "collector=ray", "collector.cars=256", "collector.processes=64")
-    ended.assert_bad_input("collector.processes=64", "has room for")
-
-
-def test_the_number_of_processes_on_a_cluster_must_be_given(call):
-    ended = call("train", "collector=ray", "collector.processes=null")
-    ended.assert_bad_input("give the number of processes")
 
 
 SERVER, MACHINES = "postgresql+psycopg://me@host/name", ["10.0.0.1", "10.0.0.2"]

@@ -10,11 +10,11 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, cast
 
-from deepracer_exp.collectors import ray_cluster
 from deepracer_exp.config.sweep import RayExecutor, SweepConfig
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.tracking.store import Store
 
+from . import ray_cluster
 from .launcher import newest_beat, run_worker
 from .lease import Answer, Beat
 from .storage import resolve_database
@@ -192,8 +192,6 @@ class WorkerActor:
             )
         if Path(folder).is_dir():
             os.chdir(folder)
-        # For a trial with collector=ray.
-        os.environ["RAY_ADDRESS"] = ray.get_runtime_context().gcs_address
         log = str(config.folder / f"workers-{os.uname().nodename}.log")
         # Its parent is the actor's process, which it does not outlive.
         context = multiprocessing.get_context("spawn")

@@ -1,11 +1,10 @@
-"""The Ray cluster on which the workers of a sweep, or the cars of a run, are placed."""
+"""The Ray cluster on which the workers of a sweep are placed."""
 
 import importlib.util
 import os
 import socket
 from typing import Any
 
-from deepracer_exp.config.running import CollectorConfig
 from deepracer_exp.errors import BadInput
 
 _ANSWER_S = 5.0
@@ -20,11 +19,7 @@ def connect(address: str, asked_by: str) -> None:
     if importlib.util.find_spec("ray") is None:
         raise BadInput(asked_by, "needs Ray; install it with: pip install 'deepracer-exp[ray]'")
     import ray
-    from ray._private import ray_constants
 
-    # Otherwise Ray asks a dead cluster twenty times, for half a minute. Its environment variable would come too late:
-    # it is read when TorchRL imports Ray.
-    ray_constants.NUM_REDIS_GET_RETRIES = 1
     if ray.is_initialized():
         return
     reachable = os.environ.get("RAY_ADDRESS", address) if address == "auto" else address
@@ -59,23 +54,6 @@ def room(needs: dict[str, float]) -> int:
         int(min(node["Resources"].get(name, 0.0) / amount for name, amount in wanted.items()))
         for node in _nodes()
     )
-
-
-def check_collector(config: CollectorConfig) -> None:
-    """Join the cluster of `collector=ray`; nothing to do for the other collectors.
-
-    Raises:
-        BadInput: no cluster, or one that is too small.
-    """
-    if config.mode != "ray":
-        return
-    connect("auto", "collector=ray")
-    cores = config.threads or 1
-    places = room({"CPU": cores})
-    if places < (config.processes or 1):
-        raise BadInput(
-            f"collector.processes={config.processes}: the Ray cluster has room for {places} of {cores} cores each"
-        )
 
 
 def _nodes() -> list[dict[str, Any]]:
