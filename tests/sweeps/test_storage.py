@@ -19,7 +19,7 @@ from deepracer_exp.sweeps.queue.storage import open_storage, patiently, resolve_
 from deepracer_exp.sweeps.queue.study import load_study
 from deepracer_exp.sweeps.trial import SeedRun
 from tests.conftest import refused
-from tests.waiting import PATIENCE_S, wait_until
+from tests.waiting import PATIENCE_S
 
 from .racer import make_trials
 
@@ -157,17 +157,6 @@ def test_no_password_is_shown_by_a_storage_nor_by_a_server_that_refuses(postgres
     for text in (repr(storage), str(storage), unknown, repr(database), wrong, missing):
         assert "s3cr" not in text
         assert "wr0ng" not in text
-
-
-def test_a_server_is_connected_to_only_while_it_is_asked(postgres_server):
-    """A thousand workers would need as many connections otherwise; PostgreSQL has a hundred."""
-    url = postgres_server.new_database()
-    storage = open_storage(url, Path())
-    optuna.create_study(study_name="study", storage=storage).ask()
-    TrialClaims(storage.engine, "study").claim("one", 1, HOUR_S)
-    name = sa.make_url(url).database
-    count = f"SELECT count(*) FROM pg_stat_activity WHERE datname = '{name}'"
-    wait_until(lambda: not postgres_server.execute(count)[0][0], "end of the connections")
 
 
 def test_transactions_share_a_connection(postgres_server):

@@ -53,10 +53,6 @@ _CLOCKS = {
 }
 
 
-Held = tuple[int, str, int]
-"""Number of a trial, its owner, and which of its owners that is, from 1."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Claim:
     """One row of the table: a trial, the worker that owns it, and what earlier owners left."""
@@ -75,11 +71,6 @@ class Claim:
     def has_ended(self) -> bool:
         """Whether the trial has its result."""
         return self.trial.state != "RUNNING"
-
-    @property
-    def held(self) -> Held:
-        """What is held of the trial, by whom."""
-        return self.trial.number, self.owner, self.attempt
 
     def is_final_as(self, number: int) -> bool:
         """Return whether this is the claim of the trial of that number, and its row never changes again."""
@@ -140,24 +131,6 @@ class TrialClaims:
         """
         more = {} if progress is None else {_of.progress: json.dumps(dict(progress))}
         return self._update_held(claim, {_of.expires_s: self._now + lease_s, **more})
-
-    def renew_all(self, held: Mapping[Held, Mapping[str, Any] | None], lease_s: float) -> set[Held]:
-        """Restart the leases of several claims in one statement; return those that are still held.
-
-        Each has its progress as `renew` takes it. A lease that `release` has ended stays so: its owner is gone, however
-        late its last sign of life arrives.
-        """
-        progress = {
-            number: json.dumps(dict(shown)) for (number, *_), shown in held.items() if shown is not None
-        }
-        values: dict[Any, Any] = {_of.expires_s: self._now + lease_s}
-        if progress:
-            values[_of.progress] = sa.case(progress, value=_of.number, else_=_of.progress)
-        key = (_of.number, _of.owner, _of.attempt)
-        where = (sa.tuple_(*key).in_(list(held)), _is_held, _of.expires_s > _RELEASED)
-        with self._engine.begin() as connection:
-            renewed = connection.execute(self._statement(values, *where).returning(*key)).all()
-        return {(row.number, row.owner, row.attempt) for row in renewed}
 
     def record(
         self,

@@ -14,7 +14,6 @@ from deepracer_exp.training.signals import Interruption
 
 from .claims import Claim, TrialClaims
 from .launcher import LocalLauncher, LocalWorker
-from .lease import LeaseKeeper
 from .ray_launcher import RayLauncher, RayWorker
 from .storage import patiently
 from .worker_config import WorkerConfig, is_gone
@@ -66,12 +65,11 @@ class Driver:
         self._ended_before = frozenset(claim.trial.number for claim in claims if claim.has_ended)
         for owner in {claim.owner for claim in claims if not claim.has_ended and is_gone(claim.owner)}:
             self._release(owner)
-        with LeaseKeeper(self._claims, self._config.config.lease_s, lambda: [*self._running]):
-            try:
-                return self._make_trials(interruption)
-            except BaseException:
-                self._kill()
-                raise
+        try:
+            return self._make_trials(interruption)
+        except BaseException:
+            self._kill()
+            raise
 
     def _make_trials(self, interruption: Interruption) -> int | None:
         for _ in range(self._launcher.workers):

@@ -1,11 +1,9 @@
 """Worker processes: what runs in one, and how the driver starts and ends those on this machine."""
 
-import contextlib
 import logging
 import multiprocessing
 import os
 import sys
-from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
@@ -16,7 +14,6 @@ from deepracer_exp.lifeline import end_with_owner
 from deepracer_exp.sim.batch import cores
 from deepracer_exp.training.signals import Interruption
 
-from .lease import Answer, Beat
 from .worker_config import WorkerConfig, owner_name
 
 _log = logging.getLogger("deepracer_exp")
@@ -42,12 +39,9 @@ class LocalLauncher:
     def start(self, config: WorkerConfig, token: str) -> "LocalWorker":
         """Start a worker; `token` makes its name unique."""
         log = str(config.folder / "workers.log")
-        ours, theirs = self._context.Pipe()
-        started = self._context.Process(target=run_worker, args=(config, token, log, theirs))
+        started = self._context.Process(target=run_worker, args=(config, token, log))
         started.start()
-        # Only the worker holds its end, so that it closes with the worker.
-        theirs.close()
-        return LocalWorker(started, token, ours)
+        return LocalWorker(started, token)
 
     def close(self) -> None:
         """Do nothing: its processes are joined."""
@@ -59,9 +53,9 @@ class LocalWorker:
     is_seen = True
     """Whether a worker that ended is certainly gone; on a lost machine it may still run."""
 
-    def __init__(self, started: BaseProcess, token: str, line: Connection):
+    def __init__(self, started: BaseProcess, token: str):
         assert started.pid is not None
-        self._process, self._line = started, line
+        self._process = started
         self.owner: str | None = owner_name(started.pid, token)
         """Name of the worker in the trial claims; None while it waits for room on a cluster."""
 
@@ -69,15 +63,6 @@ class LocalWorker:
     def exitcode(self) -> int | None:
         """Exit code; None while it lives."""
         return self._process.exitcode
-
-    def hear(self) -> Beat | None:
-        """Return its newest sign of life, None if there was none since the last call."""
-        return newest_beat(self._line)
-
-    def answer(self, answer: Answer) -> None:
-        """Answer its last sign of life."""
-        with contextlib.suppress(OSError):
-            self._line.send(answer)
 
     def terminate(self) -> None:
         """Ask it to end, with a checkpoint of its trial."""
@@ -93,17 +78,8 @@ class LocalWorker:
         self._process.join()
 
 
-def newest_beat(line: Connection) -> Beat | None:
-    """Return the newest sign of life on the line to a worker, None if there is none or the worker is gone."""
-    beat: Beat | None = None
-    with contextlib.suppress(EOFError, OSError):
-        while line.poll():
-            beat = line.recv()
-    return beat
-
-
-def run_worker(config: WorkerConfig, token: str, log: str, driver: Connection) -> None:
-    """Run a worker; the target of its process, whose output goes to the file `log`. `driver` is the line to its driver.
+def run_worker(config: WorkerConfig, token: str, log: str) -> None:
+    """Run a worker; the target of its process, whose output goes to the file `log`.
 
     Exits with 0 when the study has all its trials, 130 or 143 when asked to end, 2 if the database cannot be used, 3
     if it does not answer.
@@ -128,7 +104,7 @@ def run_worker(config: WorkerConfig, token: str, log: str, driver: Connection) -
         torch.set_num_threads(1)
         try:
             storage = open_storage(config.config.storage, config.runs_dir, config.config.patience_s)
-            Worker(config, storage, owner_name(os.getpid(), token), driver).work(interruption)
+            Worker(config, storage, owner_name(os.getpid(), token)).work(interruption)
         except (BadInput, RunFailed) as error:
             _log.error("%s", error)
             sys.exit(error.exit_code)

@@ -5,18 +5,16 @@ import multiprocessing
 import os
 import uuid
 from collections.abc import Sequence
-from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from deepracer_exp.config.sweep import RayExecutor, SweepConfig
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.tracking.store import Store
 
 from . import ray_cluster
-from .launcher import newest_beat, run_worker
-from .lease import Answer, Beat
+from .launcher import run_worker
 from .storage import resolve_database
 from .worker_config import WorkerConfig, owner_name
 
@@ -72,8 +70,8 @@ class RayLauncher:
             num_gpus=self._executor.gpus_per_worker,
             scheduling_strategy="SPREAD",
             max_restarts=0,
-            # While one thread waits for the process, another passes its signs of life on, and a third can end it.
-            max_concurrency=3,
+            # While one thread waits for the process, another can end it.
+            max_concurrency=2,
         )(WorkerActor)
         actor = kind.remote()
         return RayWorker(actor, actor.begin.remote(config, token, self._marks[0], str(Path.cwd())))
@@ -91,8 +89,6 @@ class RayWorker:
     def __init__(self, actor: Any, begun: Any):
         self._actor, self._begun = actor, begun
         self._ended: Any = None
-        self._coming_beat: Any = None
-        """The answer of the actor that is under way: a sign of life of the worker, or None."""
         self._exitcode: int | None = None
         self.owner: str | None = None
         self.is_seen = True
@@ -107,24 +103,6 @@ class RayWorker:
         if self._exitcode is None:
             self._look(0.0)
         return self._exitcode
-
-    def hear(self) -> Beat | None:
-        """Return the newest sign of life that has arrived, None if there was none since the last call."""
-        import ray
-
-        if self._ended is None or self._exitcode is not None:
-            return None
-        with contextlib.suppress(ray.exceptions.RayError):  # whose process is gone, is noticed elsewhere
-            if self._coming_beat is None:
-                self._coming_beat = self._actor.hear.remote(None)
-            if ray.wait([self._coming_beat], timeout=0.0)[0]:
-                beat, self._coming_beat = self._coming_beat, None
-                return cast("Beat | None", ray.get(beat))
-        return None
-
-    def answer(self, answer: Answer) -> None:
-        """Send an answer to the last sign of life on its way."""
-        self._coming_beat = self._actor.hear.remote(answer)
 
     def terminate(self) -> None:
         """Ask it to end; one that still waits for room ends at once."""
@@ -172,10 +150,9 @@ class RayWorker:
 
 
 class WorkerActor:
-    """Reserves cores of a node and runs a worker's process there; a Ray actor with three threads."""
+    """Reserves cores of a node and runs a worker's process there; a Ray actor with two threads."""
 
     _process: BaseProcess
-    _line: Connection
 
     def begin(self, config: WorkerConfig, token: str, mark: Path, folder: str) -> str:
         """Start the process in the sweep's working folder and return the worker's name.
@@ -195,10 +172,8 @@ class WorkerActor:
         log = str(config.folder / f"workers-{os.uname().nodename}.log")
         # Its parent is the actor's process, which it does not outlive.
         context = multiprocessing.get_context("spawn")
-        self._line, theirs = context.Pipe()
-        self._process = context.Process(target=run_worker, args=(config, token, log, theirs))
+        self._process = context.Process(target=run_worker, args=(config, token, log))
         self._process.start()
-        theirs.close()
         assert self._process.pid is not None
         return owner_name(self._process.pid, token)
 
@@ -206,13 +181,6 @@ class WorkerActor:
         """Wait for the process and return its exit code."""
         self._process.join()
         return self._process.exitcode
-
-    def hear(self, answer: Answer | None) -> Beat | None:
-        """Pass an answer on to the process, and return its newest sign of life, None if there is none."""
-        if answer is not None:
-            with contextlib.suppress(OSError):
-                self._line.send(answer)
-        return newest_beat(self._line)
 
     def signal(self, how: str) -> None:
         """Ask the process to end (`terminate`), or end it at once (`kill`)."""

@@ -31,8 +31,6 @@ from deepracer_exp.sweeps import DEFAULT_FILE
 from deepracer_exp.tracking.calls import redacted_line
 from deepracer_exp.tracking.store import check_database_file
 
-from .pool import POOL, close_when_idle
-
 Result = TypeVar("Result")
 
 DOWN = (OperationalError, InterfaceError, InternalError, PoolTimeout, StorageInternalError)
@@ -51,6 +49,9 @@ _CONNECT_S = 10
 _STUCK_S = 60
 """Seconds a process may leave a transaction open, or wait for one: a suspended machine must not block others."""
 _LOCK_NUMBER = 0x64726578
+_POOL = {"pool_pre_ping": True, "pool_recycle": 300, "pool_size": 1}
+"""Arguments of SQLAlchemy's `create_engine` for a server: a worker keeps one connection, and one that was broken by a
+restart of the server or open while its machine slept is replaced before it is used."""
 
 _log = logging.getLogger("deepracer_exp")
 
@@ -74,7 +75,7 @@ class Database:
         if self.file is not None:
             return {"connect_args": {"timeout": _STUCK_S}}
         if self.url.get_driver_name() not in ("psycopg", "psycopg2"):
-            return dict(POOL)
+            return dict(_POOL)
         arguments = {
             "connect_timeout": _CONNECT_S,
             "keepalives_idle": 15,
@@ -84,7 +85,7 @@ class Database:
             "options": f"-c idle_in_transaction_session_timeout={_STUCK_S}s -c lock_timeout={_STUCK_S}s",
         }
         chosen = {key: value for key, value in arguments.items() if key not in self.url.query}
-        return {**POOL, "connect_args": chosen}
+        return {**_POOL, "connect_args": chosen}
 
     @contextmanager
     def creation_lock(self, engine: sa.Engine) -> Iterator[None]:
@@ -266,6 +267,4 @@ def _rdb(database: Database, *, create: bool) -> RDBStorage:
         storage = RDBStorage(url, engine_kwargs=database.engine_options(), skip_table_creation=not create)
     except RuntimeError as error:
         raise BadInput(database.shown, redacted_line(error)) from None
-    if database.file is None:
-        close_when_idle(storage.engine)
     return storage

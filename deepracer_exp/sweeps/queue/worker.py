@@ -5,7 +5,6 @@ import logging
 import time
 import traceback
 from collections.abc import Callable
-from multiprocessing.connection import Connection
 from typing import TypeVar
 
 import optuna
@@ -36,11 +35,9 @@ _WAIT_S = 1.0
 class Worker:
     """Claims and makes trials of one study, and reports their results."""
 
-    def __init__(
-        self, config: WorkerConfig, storage: RDBStorage, owner: str, driver: Connection | None = None
-    ):
-        """Connect to the study; `owner` is this worker's name, and `driver` leads to what renews its leases."""
-        self._config, self._storage, self._owner, self._driver = config, storage, owner, driver
+    def __init__(self, config: WorkerConfig, storage: RDBStorage, owner: str):
+        """Connect to the study; `owner` is this worker's name."""
+        self._config, self._storage, self._owner = config, storage, owner
         self._claims = TrialClaims(storage.engine, config.study)
         self._cached = optuna.storages.get_storage(storage)
         """The storage, which reads the trials that have ended only once in this process."""
@@ -68,7 +65,7 @@ class Worker:
 
     def _make(self, claim: Claim) -> None:
         lease_s = self._config.config.lease_s
-        with Lease(self._claims, claim, lease_s, self._patience_s, self._driver) as lease:
+        with Lease(self._claims, claim, lease_s, self._patience_s) as lease:
             try:
                 ended = self._ended(lease)
                 lease.held(lambda: self._claims.settle(claim, ended))
