@@ -9,33 +9,31 @@ from deepracer_exp.sweeps.trial import Trial
 
 
 class EndingStyle(NamedTuple):
-    """Colour and dash of trials with the same ending."""
+    """Colour of trials with the same ending."""
 
     color: str
-    dash: str
-    """Plotly's name of the dash."""
     meaning: str
 
 
 ENDINGS: Mapping[str, EndingStyle] = {
-    "finished": EndingStyle("#0072B2", "longdash", "used its whole budget"),
-    "converged": EndingStyle("#009E73", "solid", "learned to drive and stopped improving"),
-    "reliable": EndingStyle("#56B4E9", "dashdot", "completed enough laps"),
-    "plateau": EndingStyle("#A0C0E0", "dot", "stopped improving"),
-    "overfitting": EndingStyle("#E0C0A0", "dash", "lost held-out conditions while its return held"),
-    "collapsed": EndingStyle("#D55E00", "dash", "entropy fell before it could drive"),
-    "not_learning": EndingStyle("#E69F00", "dot", "entropy and completion stayed where they began"),
-    "other_rule": EndingStyle("#663300", "dash", "ended by another stopping rule"),
-    "median": EndingStyle("#CC79A7", "dash", "worse than the median of the others at the same point"),
-    "percentile": EndingStyle("#882255", "dot", "not among the best share of the others at the same point"),
-    "hyperband": EndingStyle("#A060E0", "dashdot", "lost its bracket"),
-    "wilcoxon": EndingStyle("#332288", "longdash", "lost to the best trial, seed by seed"),
-    "pruned": EndingStyle("#A04080", "solid", "worse than the others"),
-    "failed": EndingStyle("#000000", "longdashdot", "ended by an error"),
-    "running": EndingStyle("#9A9A9A", "dot", "still running"),
+    "finished": EndingStyle("#0072B2", "used its whole budget"),
+    "converged": EndingStyle("#009E73", "learned to drive and stopped improving"),
+    "reliable": EndingStyle("#56B4E9", "completed enough laps"),
+    "plateau": EndingStyle("#A0C0E0", "stopped improving"),
+    "overfitting": EndingStyle("#E0C0A0", "lost held-out conditions while its return held"),
+    "collapsed": EndingStyle("#D55E00", "entropy fell before it could drive"),
+    "not_learning": EndingStyle("#E69F00", "entropy and completion stayed where they began"),
+    "other_rule": EndingStyle("#663300", "ended by another stopping rule"),
+    "median": EndingStyle("#CC79A7", "worse than the median of the others at the same point"),
+    "percentile": EndingStyle("#882255", "not among the best share of the others at the same point"),
+    "hyperband": EndingStyle("#A060E0", "lost its bracket"),
+    "wilcoxon": EndingStyle("#332288", "lost to the best trial, seed by seed"),
+    "pruned": EndingStyle("#A04080", "worse than the others"),
+    "failed": EndingStyle("#000000", "ended by an error"),
+    "running": EndingStyle("#9A9A9A", "still running"),
 }
 """Styles by `Trial.ending`. Colours after Okabe and Ito (jfly.uni-koeln.de/color); the others differ from
-them for colour-blind readers, too, or are drawn with another dash."""
+them for colour-blind readers, too."""
 
 _BY_STATE = {TrialState.COMPLETE: "finished", TrialState.PRUNED: "pruned", TrialState.FAIL: "failed"}
 

@@ -28,8 +28,7 @@ from deepracer_exp.sweeps.search.objectives import (
 from deepracer_exp.sweeps.trial import Trial
 
 from .best import best_line, best_run, best_shown, best_trial, complete_trials, over_seeds, reranked
-from .figure_layout import least_width, narrowed
-from .figures import FEWEST_COMPLETE, figures
+from .figures import FEWEST_COMPLETE, figures, least_width, narrowed
 from .labels import ENDINGS, duration, ending_of, ending_words, parameter, short_keys, steps
 
 _MOST_ROWS = 300
