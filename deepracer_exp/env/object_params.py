@@ -1,6 +1,5 @@
 """The params about boxes and bots that reward functions get, with the service's mistakes where they are wanted."""
 
-from collections.abc import Collection
 from typing import Literal
 
 import numpy as np
@@ -20,7 +19,7 @@ _EYE_M, _EYE_PITCH_RAD, _NEAREST_M = (0.14529379, 0.13032555), 0.2618, 0.2
 
 
 class ObjectParams:
-    """Makes the columns `rewards.params.OBJECT_COLUMNS` of N cars, of which few reward functions read many.
+    """Makes the columns `rewards.params.OBJECT_COLUMNS` of N cars.
 
     Args:
         others: of the cars.
@@ -37,35 +36,27 @@ class ObjectParams:
         self._everyone = np.arange(rules.n_cars)
         self._mask = np.ones(others.distance_m.shape, bool)
 
-    def columns(self, now: Measures, time_s: Floats, wanted: Collection[str]) -> dict[str, np.ndarray]:
-        """Return the wanted columns, one row per car, and always `objects_mask`; `is_crashed` is not known yet.
+    def columns(self, now: Measures, time_s: Floats) -> dict[str, np.ndarray]:
+        """Return the columns but `is_crashed`, which is not known yet, and `objects_mask`, one row per car.
 
         Args:
             now: poses of the cars.
             time_s: since each episode's begin, (N,).
-            wanted: keys that are read.
         """
         others = self._others
-        columns: dict[str, np.ndarray] = {"objects_mask": self._mask}
-        if "closest_objects" in wanted or "object_in_camera" in wanted:
-            columns["closest_objects"] = closest(others.distance_m, now.ndist * self._rules.length_m)
-        if "object_in_camera" in wanted:
+        nearest = closest(others.distance_m, now.ndist * self._rules.length_m)
+        return {
+            "closest_objects": nearest,
             # The service counts the own car as number 0 here and not there.
-            tested = columns["closest_objects"][:, 1] - self._as_service
-            columns["object_in_camera"] = self._in_camera(now, tested)
-        if "objects_location" in wanted:
-            columns["objects_location"] = others.poses[..., :2].copy()
-        if "objects_left_of_center" in wanted:
-            columns["objects_left_of_center"] = others.offset_m > 0
-        if "objects_distance_from_center" in wanted:
-            columns["objects_distance_from_center"] = np.abs(others.offset_m)
-        if "objects_distance" in wanted:
-            columns["objects_distance"] = others.distance_m.copy()
-        if "objects_heading" in wanted:
-            columns["objects_heading"] = self._heading()
-        if "objects_speed" in wanted:
-            columns["objects_speed"] = self._speeds_mps(time_s)
-        return columns
+            "object_in_camera": self._in_camera(now, nearest[:, 1] - self._as_service),
+            "objects_location": others.poses[..., :2].copy(),
+            "objects_left_of_center": others.offset_m > 0,
+            "objects_distance_from_center": np.abs(others.offset_m),
+            "objects_distance": others.distance_m.copy(),
+            "objects_heading": self._heading(),
+            "objects_speed": self._speeds_mps(time_s),
+            "objects_mask": self._mask,
+        }
 
     def _heading(self) -> Floats:
         yaw_rad = self._others.poses[..., 2]

@@ -1,6 +1,6 @@
 """Boxes and bots in a race: where they begin, whom a crash is blamed on, and what cars and reward functions see."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepracer_exp.config.race import RaceConfig
-from deepracer_exp.rewards.params import OBJECT_COLUMNS
 from deepracer_exp.sim.nearby import next_ones
 from deepracer_exp.sim.others import Others
 from deepracer_exp.sim.placement import episode_seeds
@@ -114,7 +113,7 @@ class RaceOthers:
         return pose
 
     def judge(
-        self, result: StepResult, time_s: Floats | None = None, wanted: Collection[str] = OBJECT_COLUMNS
+        self, result: StepResult, time_s: Floats | None = None
     ) -> tuple[StepResult, dict[str, np.ndarray]]:
         """Apply the rules about others to the result of a step, and move the bots.
 
@@ -125,15 +124,14 @@ class RaceOthers:
         Args:
             result: of the step without others.
             time_s: since each episode's begin, (N,), as a recording has it; None: by the count of control steps.
-            wanted: keys about others that the reward function reads.
 
         Returns:
-            The result with crashes, and these columns, one row per car.
+            The result with crashes, and the columns about others, one row per car.
         """
         rules, others, now = self._rules, self.others, result.now
         time_s = lap_clock_s(rules.steps, self._period_s) if time_s is None else time_s
         hit = others.hit(now.x_m, now.y_m, now.yaw_rad)
-        columns = self._params.columns(now, time_s, wanted)
+        columns = self._params.columns(now, time_s)
         others.drive(rules.track_index, time_s, rules.steps > 1)
         self.held = rules.steps <= self._held_until
         if not self.held.any() and (hit < 0).all():

@@ -299,7 +299,7 @@ class Race:
         result = self.rules.apply()
         objects: dict[str, np.ndarray] = {}
         if self.others is not None:
-            result, objects = self.others.judge(result, wanted=self._reward_function.object_keys)
+            result, objects = self.others.judge(result)
         self._require_finite(
             "action", np.stack([steering_deg, speed_mps], axis=1), ("steering", "speed"), action
         )

@@ -1,6 +1,6 @@
 """The params dict that a reward function gets, as AWS DeepRacer defines it."""
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,8 +39,7 @@ OBJECT_COLUMNS = (
     "objects_distance",
 )
 """The keys about boxes and bots, one row per car: of K others (N, K), `objects_location` (N, K, 2); `is_crashed` and
-`object_in_camera` (N,), `closest_objects` (N, 2). Columns have them only where there are others, and of these only such
-the reward function reads (`rewards.reads`)."""
+`object_in_camera` (N,), `closest_objects` (N, 2). Columns have them only where there are others."""
 MASK = "objects_mask"
 """The further key of `reward_batch`: which entries of the arrays about others are others, (N, K); all others of a car
 come first."""
@@ -62,24 +61,15 @@ class TrackParams(NamedTuple):
         return cls([(x, y) for x, y in track.waypoints.tolist()], track.length_m, track.reversed)
 
 
-def select(
-    columns: Mapping[str, np.ndarray],
-    cars: NDArray[np.intp] | None,
-    wanted: Collection[str] | None = None,
-) -> dict[str, np.ndarray]:
-    """Return the columns of the given cars (None: all), each as a copy of its documented type.
-
-    `wanted` are the keys of the columns (None: all that there are); `x`, which every reward has, is always among them.
-    """
+def select(columns: Mapping[str, np.ndarray], cars: NDArray[np.intp] | None) -> dict[str, np.ndarray]:
+    """Return the columns of the given cars (None: all), each as a copy of its documented type."""
     chosen: dict[str, np.ndarray] = {}
     for key in BATCH_COLUMNS:
-        if wanted is None or key in wanted or key == "x":
-            column, dtype = columns[key], _DTYPES.get(key, np.float64)
-            chosen[key] = np.array(column, dtype) if cars is None else column[cars].astype(dtype, copy=False)
+        column, dtype = columns[key], _DTYPES.get(key, np.float64)
+        chosen[key] = np.array(column, dtype) if cars is None else column[cars].astype(dtype, copy=False)
     if MASK in columns:
-        for key in (*object_keys(columns), MASK):
-            if wanted is None or key in wanted:
-                chosen[key] = columns[key].copy() if cars is None else columns[key][cars]
+        for key in (*OBJECT_COLUMNS, MASK):
+            chosen[key] = columns[key].copy() if cars is None else columns[key][cars]
     return chosen
 
 
@@ -89,13 +79,8 @@ def rows(selected: Mapping[str, np.ndarray]) -> Iterable[Row]:
 
 
 def row_keys(selected: Mapping[str, np.ndarray]) -> tuple[str, ...]:
-    """Return the keys of rows: `COLUMNS`, and after them those about others that there are."""
-    return (*COLUMNS, *object_keys(selected)) if MASK in selected else COLUMNS
-
-
-def object_keys(columns: Mapping[str, np.ndarray]) -> tuple[str, ...]:
-    """Return which of `OBJECT_COLUMNS` there are."""
-    return tuple(key for key in OBJECT_COLUMNS if key in columns)
+    """Return the keys of rows: `COLUMNS`, and after them `OBJECT_COLUMNS` where there are others."""
+    return (*COLUMNS, *OBJECT_COLUMNS) if MASK in selected else COLUMNS
 
 
 def scalar_params(row: Row, road: TrackParams, keys: tuple[str, ...] = COLUMNS) -> dict[str, Any]:
@@ -132,7 +117,6 @@ def batch_params(
     selected: Mapping[str, np.ndarray],
     road: TrackParams,
     waypoints: np.ndarray,
-    wanted: Collection[str] | None = None,
 ) -> dict[str, Any]:
     """Build the same 27 keys, `previous_progress` and `objects_mask` for n cars at once, for `reward_batch`.
 
@@ -142,15 +126,13 @@ def batch_params(
         selected: Columns of `select`, shape (n,), `closest_waypoints` (n, 2).
         road: The keys that are constant on the course.
         waypoints: Those of the course as an array, (W, 2); copied.
-        wanted: The keys to build besides those of `selected`; None: all.
     """
     n = len(selected["x"])
     params: dict[str, Any] = dict(selected)
     params["track_length"], params["is_reversed"] = road.track_length, road.is_reversed
-    if wanted is None or "waypoints" in wanted:
-        params["waypoints"] = waypoints.copy()
+    params["waypoints"] = waypoints.copy()
     for key, (shape, dtype) in _ALONE.items():
-        if key not in params and (wanted is None or key in wanted):
+        if key not in params:
             params[key] = np.zeros((n, *shape), dtype)
     return params
 

@@ -4,7 +4,7 @@ import itertools
 import math
 import reprlib
 import traceback
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import CodeType
 from typing import Any, NoReturn
 
@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from deepracer_exp.errors import BadInput, RunFailed
 
 from .guard import CtrlC, DeadlinePassed, Guard, Misconduct
-from .params import OBJECT_COLUMNS, TrackParams, batch_params, row_keys, rows, scalar_params, select
+from .params import TrackParams, batch_params, row_keys, rows, scalar_params, select
 from .prints import RewardPrints
-from .reads import keys_read
 from .source import RewardSource, source_with_constants
 
 MAX_REWARD = 1e5
@@ -70,7 +69,6 @@ class RewardFunction:
     Attributes:
         is_batch: Whether `reward_batch` is called for all cars at once.
         functions: The modules' own functions, without checks and time limit; one per car, or the one of the batch.
-        object_keys: The keys about others that it may read; columns need no more of these.
 
     Raises:
         BadInput: The module cannot be run or has no callable `reward_function` or `reward_batch`.
@@ -101,8 +99,6 @@ class RewardFunction:
             what, cause = what_happened(error, source.path, time_limit_s)
             how = "" if isinstance(error, Unusable) else "cannot be run: "
             raise BadInput(source.path, f"{how}{what}") from cause
-        self._read = keys_read(source_with_constants(source), name)
-        self.object_keys = tuple(key for key in OBJECT_COLUMNS if self._read is None or key in self._read)
         self._track_params: Sequence[TrackParams] = ()
         self._waypoints: list[np.ndarray] = []
 
@@ -119,7 +115,7 @@ class RewardFunction:
 
         Args:
             columns: `params.BATCH_COLUMNS`, each (n_cars,), `closest_waypoints` (n_cars, 2), and with others on the
-                road `params.MASK` and the `object_keys`.
+                road `params.MASK` and `params.OBJECT_COLUMNS`.
             track_params: Params that are constant on each of the courses.
             active: Cars to reward, shape (n_cars,); None: all.
             track_index: Index in `track_params` of each car's course, shape (n_cars,); None: all drive on the first.
@@ -202,7 +198,7 @@ class RewardFunction:
         track_of: NDArray[np.intp],
         ids: NDArray[np.intp],
     ) -> NDArray[np.float64]:
-        """Call the function once per course; the cars of a course are adjacent. It gets the keys that it may read."""
+        """Call the function once per course; the cars of a course are adjacent."""
         if track_params is not self._track_params:
             self._track_params = track_params
             self._waypoints = [np.array(road.waypoints, dtype=float).reshape(-1, 2) for road in track_params]
@@ -211,15 +207,15 @@ class RewardFunction:
         if len(track_params) > 1:
             bounds[1:1] = (np.flatnonzero(np.diff(track_of)) + 1).tolist()
 
-        def params(first: int, last: int, wanted: Collection[str] | None = None) -> dict[str, Any]:
-            selected, place = select(columns, ids[first:last], wanted), track_of[first]
-            return batch_params(selected, track_params[place], self._waypoints[place], wanted)
+        def params(first: int, last: int) -> dict[str, Any]:
+            place = track_of[first]
+            return batch_params(select(columns, ids[first:last]), track_params[place], self._waypoints[place])
 
         ends = (0, len(ids))
         try:
             with Guard(self.time_limit_s):
                 for ends in itertools.pairwise(bounds):
-                    returned = self.functions[0](params(*ends, self._read))
+                    returned = self.functions[0](params(*ends))
                     rewards[slice(*ends)] = _as_rewards(returned, ends[1] - ends[0])
         except CtrlC:
             raise
