@@ -1,4 +1,4 @@
-"""The picture of docs/camera.md: tracks and rooms as the camera sees them, and episodes that differ by randomization.
+"""The picture of docs/camera.md: tracks as the camera sees them, and episodes that differ by randomization.
 
 python -m benchmarks.camera_picture
 """
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.config.rooms import ROOMS
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.setup import build_setup
 
@@ -39,9 +38,8 @@ def main() -> None:
     # The first car is a little before the start line.
     begin = "episode.start_offset=0.965"
     tracks = look(f"track=[{','.join(TRACKS)}]", begin)
-    rooms = np.concatenate([look(f"track.floor={room}", begin)[:1] for room in ROOMS])
     episodes = look("randomization=sim2real")
-    rows = [beside(pictures) for pictures in (tracks[:4], tracks[4:], rooms, episodes[:4], episodes[4:])]
+    rows = [beside(pictures) for pictures in (tracks[:4], tracks[4:], episodes[:4], episodes[4:])]
     width = rows[0].shape[1]
     Image.fromarray(np.vstack(rows)[GAP:, GAP:]).quantize(128).save(output, optimize=True)
     print(f"{output}: {width} pixels wide, {output.stat().st_size / 1e3:.0f} kB")

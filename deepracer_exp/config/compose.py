@@ -31,7 +31,6 @@ from .options import groups, listed, options
 from .overrides import PLAIN_TEXT, override_line, parse_single, parse_sweep
 from .own_class import allow, allow_given, own_option
 from .parse import import_own_classes, parse_config, parse_experiment
-from .rooms import in_rooms
 from .track_options import ALL, by_world_name, several_tracks
 from .track_options import GROUP as TRACK
 
@@ -112,7 +111,7 @@ def compose_entry(entry: str, overrides: Sequence[str], *, stored: bool = False)
     )
     rest = [*map(parse_single, files.lines), *rest]
     chosen = [override for override in rest if override.key_or_group in groups(entry)]
-    changing = in_rooms([override for override in rest if override.key_or_group not in groups(entry)])
+    changing = [override for override in rest if override.key_or_group not in groups(entry)]
     names: tuple[str, ...] = ()
     if TRACK in groups(entry):
         names, changing = several_tracks(chosen, changing)

@@ -15,7 +15,6 @@ from .options import groups
 from .overrides import OPEN_MAPPINGS, parse_single
 from .own_class import allow, allow_given
 from .parse import parse_config
-from .rooms import in_rooms
 
 _WHOLE = ("experiment", custom_files.KEY)
 ABSENT = "\N{EN DASH}"
@@ -44,7 +43,7 @@ def with_overrides(
     parts = [override for override in overrides if override.startswith("observation.target=")]
     if not stored:
         allow_given(parts)
-    parsed = in_rooms([parse_single(override) for override in overrides if override not in parts])
+    parsed = [parse_single(override) for override in overrides if override not in parts]
     values = without_passwords(dict(config))
     left_out = acting.leave_out_foreign(values, "the stored run")
     chosen = [

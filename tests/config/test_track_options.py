@@ -1,13 +1,11 @@
 import re
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import pytest
 
 from deepracer_exp.aws.worlds.catalogue import find_world, leaders, worlds
 from deepracer_exp.config.compose import compose_experiment, expand_grid
 from deepracer_exp.config.overrides import parse_single
-from deepracer_exp.config.rooms import ROOMS
-from deepracer_exp.config.stored import with_overrides
 from deepracer_exp.config.track import TrackConfig
 from deepracer_exp.config.track_options import by_world_name
 from tests.conftest import refused
@@ -83,49 +81,6 @@ def test_a_value_without_a_name_reaches_every_track_but_those_with_one_of_their_
     assert [track.direction for track in chosen.values()] == ["alternate", "reversed"]
 
 
-def test_a_room_changes_how_a_track_looks_and_neither_its_shape_nor_its_grip():
-    usual, gym = (
-        tracks("track=2022_summit_speedway", *more)["2022_summit_speedway"]
-        for more in ([], ["track.floor=gym"])
-    )
-    assert replace(gym, floor=usual.floor) == usual
-    changed = {name: value for name, value in vars(gym.floor).items() if value != vars(usual.floor)[name]}
-    assert changed.keys() <= ROOMS["gym"].keys()
-    assert (gym.floor.ground_color, gym.floor.walls_height_m) == ("#b98a55", 4.0)
-    assert gym.floor.friction == usual.floor.friction
-    assert len({tuple(map(str, room.values())) for room in ROOMS.values()}) == len(ROOMS)
-    assert {frozenset(room) for room in ROOMS.values()} == {frozenset(ROOMS["gym"])}
-
-
-def test_a_value_beside_a_room_counts_wherever_it_stands():
-    for words in (
-        ["track.floor=hall", "track.floor.wall_color='#000000'"],
-        ["track.floor.wall_color='#000000'", "track.floor=hall"],
-    ):
-        floor = tracks(*words)["reinvent_base"].floor
-        assert (floor.wall_color, floor.sky_color) == ("#000000", ROOMS["hall"]["sky_color"])
-
-
-def test_each_of_several_tracks_can_lie_in_a_room_of_its_own():
-    chosen = tracks(
-        "track=[Oval_track,2022_summit_speedway]",
-        "track.floor=gym",
-        "track.2022_summit_speedway.floor=garage",
-    )
-    assert [track.floor.ground_color for track in chosen.values()] == [
-        ROOMS[room]["ground_color"] for room in ("gym", "garage")
-    ]
-
-
-def test_a_clone_can_move_to_another_room():
-    composition = compose_experiment(["track.floor=gym"])[1]
-    moved = with_overrides(composition.mapping, composition.choices, ["track.floor=garage"])
-    assert (
-        moved.mapping["track"]["floor"]
-        == compose_experiment(["track.floor=garage"])[1].mapping["track"]["floor"]
-    )
-
-
 def test_a_list_in_an_experiments_file_is_refused(own):
     """Hydra would lay one track over the other."""
     own("experiment/mine.yaml", "# @package _global_\ndefaults:\n  - override /track: [Oval_track, Monaco]\n")
@@ -152,14 +107,6 @@ def test_a_sweep_over_tracks_stays_one_of_single_tracks():
         (["track=[]"], r"track=\[\]: no track; accepted: track=\[A,B\], track=all"),
         (["track=[Monaco,Monaco]"], "Monaco is listed twice; track.Monaco.weight=2"),
         ([TWO, "track.Ovl_track.weight=2"], r"Ovl_track is neither .* \(did you mean Oval_track\?\)"),
-        (
-            ["track.floor=gim"],
-            r"track.floor=gim: no such room \(did you mean gym\?\); rooms: hall, classroom",
-        ),
-        (
-            [TWO, "track.Oval_track.floor=nowhere"],
-            "track.Oval_track.floor=nowhere: no such room; rooms: hall",
-        ),
         ([TWO, "track.Monaco.weight=2"], "Monaco is neither a chosen track nor a key of all tracks"),
         ([TWO, "track.wieght=2"], r"wieght is neither .* \(did you mean weight\?\)"),
         ([TWO, "track.floor.frction=2"], r"track.floor.frction: no such key \(did you mean friction\?\)"),
