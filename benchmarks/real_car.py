@@ -1,10 +1,10 @@
 """What `experiment=real_car` drives in the simulator and as the physical car, and what its ingredients bring.
 
-    python -m benchmarks.real_car [--seeds 5] [--first-seed 1] [--tracks A,B] [--without smoothness,...] [--jobs 1]
+    python -m benchmarks.real_car [--seeds 5] [--first-seed 1] [--tracks A,B] [--without car,...] [--jobs 1]
                                   [--frames DIR] [--runs-dir DIR] [--json FILE] [OVERRIDE...]
 
 For each track and seed `deepracer-exp train experiment=real_car` trains as the experiment has it, and once more without
-each of the ingredients of `--without`: without `smoothness` of the policy's actions; without the `car`'s own picture,
+each of the ingredients of `--without`: without the `car`'s own picture,
 timing and controls in the training (`randomization=sim2real`); without its `speeds`, with those of the default action
 space; without its `off_road_cost` of five metres, with the usual two; without `sim2real` and the car. OVERRIDE goes to
 all of them: `device=cuda collector=in_process` for a GPU. The recipe was chosen on the seeds 0 and 100, which are left
@@ -71,7 +71,6 @@ from .report import (
 
 TRACKS = ("reinvent_base", "reInvent2019_track")
 WITHOUT: dict[str, list[str]] = {
-    "smoothness": ["algorithm.smoothness=0.0"],
     "car": ["randomization=sim2real"],
     "speeds": ["action_space=continuous"],
     "off_road_cost": ["reward=progress_delta"],
@@ -206,9 +205,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--first-seed", type=int, default=1, help="the others follow it")
     parser.add_argument("--tracks", type=_names, default=TRACKS, help=f"default: {','.join(TRACKS)}")
     known = ",".join(WITHOUT)
-    parser.add_argument(
-        "--without", type=_names, default=("smoothness",), help=f"some of {known}; default: smoothness"
-    )
+    parser.add_argument("--without", type=_names, default=(), help=f"some of {known}")
     parser.add_argument("--jobs", type=int, default=1, help="trainings at once")
     parser.add_argument(
         "--frames", type=Path, help="folder of pictures, 160x120, for the archive in OpenVINO"
@@ -224,7 +221,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         rows = benchmark(options, (options.runs_dir or Path(temporary)).resolve())
     print(f"\n{table(HEAD, list(map(_cells, rows)))}")
     wanted = ", ".join(f"{share:.0%} ({name})" for name, share in WANTED.items())
-    print(f"\nwanted within {WANTED_S / 60:.0f} minutes on two cores: laps {wanted}; half of the zig-zag")
+    print(f"\nwanted within {WANTED_S / 60:.0f} minutes on two cores: laps {wanted}")
     write_json(
         options.json,
         {"trainings": rows, "trials": TRIALS, "seeds": options.seeds, "overrides": options.overrides},

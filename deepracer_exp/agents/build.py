@@ -2,7 +2,6 @@
 
 import torch
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
 
 from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.config.learning import (
@@ -13,7 +12,6 @@ from deepracer_exp.config.learning import (
     SACConfig,
 )
 from deepracer_exp.config.own_class import OwnClass, build_own
-from deepracer_exp.errors import BadInput
 
 from .actor_critic import ActorCritic, PolicyNetworks, build_actor_critic
 from .algorithm import Algorithm
@@ -45,16 +43,14 @@ def build_agent(
     seed: int,
     teacher: TensorDictModuleBase | None = None,
     device: torch.device = _CPU,
-    commands: Tensor | None = None,
 ) -> Algorithm:
     """Return the algorithm of the group `algorithm`, with its learning-rate schedule.
 
     It updates the networks in place, on `device`; a class of the user's own chooses that itself. A `teacher`, a policy
-    with the same actions, is imitated for the first `config.teacher_iterations`. `commands` are what the actions of a
-    discrete policy mean, see `Smoothness`.
+    with the same actions, is imitated for the first `config.teacher_iterations`.
 
     Raises:
-        BadInput: a class of the user's own cannot be used, or has no loss that could be smooth.
+        BadInput: a class of the user's own cannot be used.
     """
     schedule = build_schedule(lr_schedule)
     if isinstance(config, SACConfig):
@@ -73,8 +69,4 @@ def build_agent(
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             agent = build_own(described, "algorithm.target", Algorithm, networks, config, schedule, seed)
-    if config.smoothness:
-        if not isinstance(agent, PPO):
-            raise BadInput(f"algorithm.smoothness={config.smoothness:g}", f"{config.target} is no PPO", "0")
-        agent.smooth(commands)
     return agent

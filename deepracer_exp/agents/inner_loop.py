@@ -2,7 +2,7 @@
 
 A gradient step on some hundred steps of features is small: TorchRL, TensorDict and autograd need four times as long as
 the products it consists of. Here the derivatives of `ClipPPOLoss` stand as formulas, and an epoch's gradient steps are
-one call. Pictures, shared trunks, networks and losses of the user's own and `algorithm.smoothness` are differentiated
+one call. Pictures, shared trunks, and networks and losses of the user's own are differentiated
 by autograd, see `PPO`.
 """
 

@@ -19,7 +19,6 @@ from .actor_critic import ActorCritic
 from .algorithm import Algorithm, UpdateMetrics, require_finite
 from .inner_loop import InnerLoop
 from .schedules import Schedule
-from .smoothness import Smoothness
 
 _CPU = torch.device("cpu")
 _PICTURES_AT_ONCE = 1024
@@ -30,7 +29,6 @@ _LOSS_NAMES = {
     "loss_objective": "policy loss",
     "loss_critic": "value loss",
     "loss_entropy": "entropy",
-    "loss_smoothness": "smoothness loss",
 }
 
 
@@ -41,11 +39,7 @@ class _Loss(ClipPPOLoss):
     finite, which would end in an error of torch.multinomial instead of the name of what is not finite.
     """
 
-    acted: Distribution
-    """The policy's in the last minibatch."""
-
     def _get_entropy(self, dist: Distribution, adv_shape: torch.Size) -> Tensor:
-        self.acted = dist
         return dist.entropy().unsqueeze(-1)
 
 
@@ -75,7 +69,7 @@ class PPO(Algorithm):
         there. The seed is that of the stream that shuffles the minibatches.
         """
         super().__init__(actor_critic, config, schedule, seed)
-        self._generator, self._seed = torch.Generator().manual_seed(seed), seed
+        self._generator = torch.Generator().manual_seed(seed)
         self._device = device
         self._learner = actor_critic if device == _CPU else copy.deepcopy(actor_critic).to(device)
         self._parameters = list(self._learner.parameters())
@@ -102,25 +96,13 @@ class PPO(Algorithm):
             log_explained_variance=False,
             device=device,
         )
-        self._smoothness: Smoothness | None = None
         fits = config.compiled and device == _CPU and InnerLoop.fits(actor_critic)
         self._compiled = InnerLoop(actor_critic, self._optimizer, config) if fits else None
-
-    def smooth(self, commands: Tensor | None) -> None:
-        """Add the loss of `algorithm.smoothness`; a subclass's constructor need not know of it.
-
-        Args:
-            commands: What the actions of a discrete policy mean, see `Smoothness`.
-        """
-        self._smoothness = Smoothness(
-            self._learner, self.config.smoothness, commands, self._seed, self._device
-        )
 
     @property
     def _inner_loop(self) -> InnerLoop | None:
         """Return the compiled loop that makes the gradient steps of `loss`; None where autograd makes them."""
-        is_ours = type(self).loss is PPO.loss and self._smoothness is None
-        return self._compiled if is_ours else None
+        return self._compiled if type(self).loss is PPO.loss else None
 
     def loss(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return the losses of a minibatch; override it for a loss of your own.
@@ -130,15 +112,10 @@ class PPO(Algorithm):
                 `action_log_prob`, `advantage` and `value_target`.
 
         Returns:
-            `loss_objective`, `loss_critic`, `loss_entropy` and, with `algorithm.smoothness`, `loss_smoothness`, which
-            are added up, and `entropy`, `clip_fraction`, `mean_ratio` and `kl_approx`, which are recorded.
+            `loss_objective`, `loss_critic` and `loss_entropy`, which are added up, and `entropy`, `clip_fraction`,
+            `mean_ratio` and `kl_approx`, which are recorded.
         """
-        losses = self._loss(minibatch)
-        if self._smoothness is not None:
-            losses["loss_smoothness"] = self._smoothness(
-                minibatch, losses["loss_objective"], self._loss.acted
-            )
-        return losses
+        return self._loss(minibatch)
 
     def rates(self, iteration: int, fraction: float) -> dict[str, float]:
         """Return the learning rate and the weight of the entropy bonus, see `Algorithm.rates`."""
@@ -192,8 +169,6 @@ class PPO(Algorithm):
             for index, state in optimizer["state"].items()
         }
         updating = {"optimizer": {**optimizer, "state": moments}, "generator": self._generator.get_state()}
-        if self._smoothness is not None:
-            updating["smoothness"] = self._smoothness.state_dict()
         return super().state_dict() | updating
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -201,14 +176,9 @@ class PPO(Algorithm):
         super().load_state_dict(state)
         self._optimizer.load_state_dict(state["optimizer"])
         self._generator.set_state(state["generator"])
-        # A policy that was trained without it may be trained on with it.
-        if self._smoothness is not None and "smoothness" in state:
-            self._smoothness.load_state_dict(state["smoothness"])
 
     def _shuffled(self, count: int) -> Tensor:
-        in_pairs = self._smoothness is not None and self._smoothness.in_pairs
-        shuffle = Smoothness.pairs if in_pairs else torch.randperm
-        return shuffle(count, generator=self._generator).to(self._device)
+        return torch.randperm(count, generator=self._generator).to(self._device)
 
     @torch.no_grad()
     def _prepare(self, batch: TensorDictBase) -> tuple[TensorDictBase, float]:
@@ -239,8 +209,6 @@ class PPO(Algorithm):
         steps = batch.select(*self._learner.in_keys, "action", "action_log_prob")
         steps.update(estimates.select("advantage", "value_target"))
         steps = steps.reshape(-1)
-        if self._smoothness is not None:
-            self._smoothness.prepare(steps, batch)
         # A constant target has no variance to explain.
         explained = 1 - unexplained / total.clamp_min(torch.finfo(total.dtype).tiny)
         return steps, explained.item() if total > 0 else 0.0
@@ -260,8 +228,6 @@ class PPO(Algorithm):
             minibatch = self._learner.trunk(minibatch)
         losses = self.loss(minibatch)
         loss = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
-        if "loss_smoothness" in losses:
-            loss = loss + losses["loss_smoothness"]
         self._optimizer.zero_grad()
         loss.backward()
         grad_norm = nn.utils.get_total_norm([p.grad for p in self._parameters if p.grad is not None])
@@ -346,7 +312,7 @@ class Distillation(PPO):
 
     @property
     def _inner_loop(self) -> InnerLoop | None:
-        return None if self._imitates or self._smoothness is not None else self._compiled
+        return None if self._imitates else self._compiled
 
     def loss(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return the losses as PPO does."""

@@ -34,9 +34,7 @@ ZIGZAG_DEG = 5.0
 """Angle to either side below which it cannot be seen."""
 LEAST_M = 10.0
 """Metres of straight without which the figures say little."""
-CURE = (
-    "an action space with smaller angles; algorithm.smoothness=0.02 helps some trainings (docs/smoothness.md)"
-)
+CURE = "an action space with smaller angles"
 
 CONSOLE_CURE = "smaller steering angles in the action space"
 """What helps a training of the service, in the words of its console."""

@@ -96,7 +96,6 @@ class PPOConfig(AlgorithmConfig):
     entropy_coeff: NonNegative
     entropy_end_factor: NonNegative = 1.0
     critic_coeff: Positive
-    smoothness: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 0.0
     compiled: bool = True
     teacher_iterations: Annotated[int, Field(ge=0, le=10**6)] = 0
     teacher_batch_size: Annotated[int, Field(ge=1, le=10**6)] = 128

@@ -21,7 +21,6 @@ from deepracer_exp.agents.build import build_agent, build_networks
 from deepracer_exp.collectors.base import Collector
 from deepracer_exp.collectors.collector import open_collector
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.env.action_space import DiscreteActions
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.env.placement import placements_table
 from deepracer_exp.env.setup import RaceSetup
@@ -125,9 +124,6 @@ class Trainer:
             experiment.seed,
             None if experiment.teacher is None else read_teacher(folder.path),
             torch.device(experiment.device),
-            torch.from_numpy(setup.actions.scaled).float()
-            if isinstance(setup.actions, DiscreteActions)
-            else None,
         )
         self.agent.threads = share or cores()
         rivals = experiment.race.rivals

@@ -19,7 +19,6 @@ def test_a_training_without_an_ingredient_differs_in_that_alone() -> None:
     whole = compose_experiment(real_car.training_overrides("reinvent_base", None, []))[0]
     assert whole.randomization.real_car is not None
     for without, changed in {
-        "smoothness": {"algorithm": replace(whole.algorithm, smoothness=0.0)},
         "car": {"randomization": compose_experiment(["randomization=sim2real"])[0].randomization},
         "off_road_cost": {"reward": compose_experiment([])[0].reward},
         "speeds": {"action_space": compose_experiment([])[0].action_space},

@@ -71,7 +71,7 @@ def whole(trained, *overrides):
         ("observation=lidar", "randomization=sim2real"),
         (
             *("observation=camera", "randomization=real_car", "collector.cars=4", "algorithm.batch_size=64"),
-            *("algorithm.smoothness=0.02", "algorithm.frames_per_iteration=256", "algorithm.epochs=1"),
+            *("algorithm.frames_per_iteration=256", "algorithm.epochs=1"),
             *("checkpoints.every=null", "action_space.steering_angle.high=20"),
         ),
         (

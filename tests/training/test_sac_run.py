@@ -124,7 +124,6 @@ def test_a_clone_begins_with_policy_and_critics_and_an_empty_replay(copied, call
     ("overrides", "words"),
     [
         (("algorithm.epochs=3",), ("algorithm.epochs", "no such key")),
-        (("algorithm.smoothness=1",), ("algorithm.smoothness", "no such key")),
         (("lr_schedule=adaptive_kl",), ("lr_schedule=adaptive_kl", "linear")),
         (("network=mlp_small_shared",), ("network.shared_trunk=true", "accepted: false")),
         (("teacher=somewhere",), ("teacher", "algorithm=distill")),
