@@ -1,6 +1,6 @@
 """Wall seconds until a car that learned from nothing drives a lap, and until it drives reliably.
 
-    python -m benchmarks.time_to_lap [--seeds 3] [--distill] [--json FILE] [OVERRIDE...]
+    python -m benchmarks.time_to_lap [--seeds 3] [--json FILE] [OVERRIDE...]
 
 For each seed, `deepracer-exp train stopping=reliable seed=K` runs as a process of its own in an empty folder, with
 everything the default has: MLflow, trace, evaluations, checkpoints. Times count from the start of that process (imports
@@ -11,14 +11,10 @@ and start of the workers included) and are read from its summary.json:
 - `reliable_s`, `reliable_steps`: 90 per cent of the last 50 training episodes completed the lap (the stopping
   rule, which then ends the run). null where the budget ended the run before.
 
-With `--distill` a policy that sees features is trained first for TEACHER_STEPS, on the same track, and the run learns
-from it (`algorithm=distill`). The teacher's time, `teacher_s`, counts; its steps do not.
-
 Steps are control steps over all cars. The median counts null as longer than anything.
 """
 
 import tempfile
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -30,40 +26,29 @@ WANTED_S = {"first_lap_s": 20.0, "reliable_s": 120.0}
 """Medians to stay below on two cores."""
 CONSOLE_FIRST_LAP_STEPS = 19_472
 """Of a training on the AWS console on reinvent_base with 14 actions of 1 to 2 m/s, counted in its log."""
-TEACHER_STEPS = 300_000
 FIGURES = ("first_lap_s", "first_lap_steps", "reliable_s", "reliable_steps")
 
 
-def measure(seed: int, overrides: Sequence[str], distill: bool = False) -> dict[str, Any]:
+def measure(seed: int, overrides: Sequence[str]) -> dict[str, Any]:
     """Train with one seed."""
     with tempfile.TemporaryDirectory() as place:
-        folder, began, teacher_s, own = Path(place), time.monotonic(), 0.0, [*overrides, f"seed={seed}"]
-        if distill:
-            same = [one for one in overrides if one.startswith(("track", "car", "action_space", "reward"))]
-            teacher = train(
-                ["name=teacher", f"budget.env_steps={TEACHER_STEPS}", f"seed={seed}", *same], folder
-            )
-            teacher_s = round(time.monotonic() - began, 3)
-            own = ["algorithm=distill", f"teacher={teacher}", *own]
-        summary = read_summary(train(["stopping=reliable", *own], folder))
+        summary = read_summary(train(["stopping=reliable", *overrides, f"seed={seed}"], Path(place)))
     moments = {"first_lap": summary["first_lap"] or {}, "reliable": summary["reliable"] or {}}
     figures: dict[str, Any] = {"seed": seed}
     for name, moment in moments.items():
-        since_s = moment.get("since_process_start_s")
-        figures[f"{name}_s"] = None if since_s is None else round(since_s + teacher_s, 3)
+        figures[f"{name}_s"] = moment.get("since_process_start_s")
         figures[f"{name}_steps"] = moment.get("env_steps")
-    return figures | ({"teacher_s": teacher_s} if distill else {})
+    return figures
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and print."""
     parser = benchmark_parser("time_to_lap", __doc__)
     parser.add_argument("--seeds", type=int, default=3, help="number of runs, with the seeds 0, 1, ...")
-    parser.add_argument("--distill", action="store_true", help="learn from a teacher that sees features")
     options = parser.parse_args(arguments)
     seeds = []
     for seed in range(options.seeds):
-        seeds.append(measure(seed, options.overrides, options.distill))
+        seeds.append(measure(seed, options.overrides))
         print(f"seed {seed}: " + ", ".join(f"{key} {number(seeds[-1][key])}" for key in FIGURES), flush=True)
     medians = {f"median_{key}": median([row[key] for row in seeds]) for key in FIGURES}
     rows = [
@@ -76,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     head = ("seed", "first lap (s)", "first lap (steps)", "reliable (s)", "reliable (steps)")
     rows += [("median", *middle), ("wanted, at most", *wanted), ("a run of the AWS console", *console)]
     print(f"\n{table(head, rows)}")
-    given = {"overrides": options.overrides, "distill": options.distill}
+    given = {"overrides": options.overrides}
     write_json(options.json, {"seeds": seeds, **medians, "wanted": WANTED_S, **given})
 
 

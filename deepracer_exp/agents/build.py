@@ -1,7 +1,6 @@
 """The algorithm of an experiment, and the networks that it trains."""
 
 import torch
-from tensordict.nn import TensorDictModuleBase
 
 from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.config.learning import (
@@ -15,7 +14,7 @@ from deepracer_exp.config.own_class import OwnClass, build_own
 
 from .actor_critic import ActorCritic, PolicyNetworks, build_actor_critic
 from .algorithm import Algorithm
-from .ppo import PPO, Distillation
+from .ppo import PPO
 from .sac import SAC
 from .schedules import build_schedule
 from .soft_actor_critic import SoftActorCritic, build_soft_actor_critic
@@ -41,13 +40,11 @@ def build_agent(
     config: AlgorithmConfig,
     lr_schedule: LRScheduleConfig,
     seed: int,
-    teacher: TensorDictModuleBase | None = None,
     device: torch.device = _CPU,
 ) -> Algorithm:
     """Return the algorithm of the group `algorithm`, with its learning-rate schedule.
 
-    It updates the networks in place, on `device`; a class of the user's own chooses that itself. A `teacher`, a policy
-    with the same actions, is imitated for the first `config.teacher_iterations`.
+    It updates the networks in place, on `device`; a class of the user's own chooses that itself.
 
     Raises:
         BadInput: a class of the user's own cannot be used.
@@ -58,15 +55,13 @@ def build_agent(
         return SAC(networks, config, schedule, seed, device)
     assert isinstance(networks, ActorCritic)
     assert isinstance(config, PPOConfig)
-    agent: Algorithm
-    if teacher is not None:
-        agent = Distillation(networks, config, schedule, seed, teacher, device)
-    elif config.target is None:
-        agent = PPO(networks, config, schedule, seed, device)
-    else:
-        described = OwnClass(target=config.target, kwargs=config.kwargs)
-        # Its constructor may draw weights; the global random state has no part in them.
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            agent = build_own(described, "algorithm.target", Algorithm, networks, config, schedule, seed)
+    if config.target is None:
+        return PPO(networks, config, schedule, seed, device)
+    described = OwnClass(target=config.target, kwargs=config.kwargs)
+    # Its constructor may draw weights; the global random state has no part in them.
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        agent: Algorithm = build_own(
+            described, "algorithm.target", Algorithm, networks, config, schedule, seed
+        )
     return agent

@@ -1,4 +1,4 @@
-"""Clipped proximal policy optimisation from TorchRL's parts, and the imitation of a teacher before it."""
+"""Clipped proximal policy optimisation from TorchRL's parts."""
 
 import copy
 import math
@@ -6,9 +6,8 @@ from typing import Any, NoReturn
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torch.distributions import Distribution, kl_divergence
+from torch.distributions import Distribution
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
@@ -22,8 +21,6 @@ from .schedules import Schedule
 
 _CPU = torch.device("cpu")
 _PICTURES_AT_ONCE = 1024
-_TEMPERATURE = 0.1
-"""Temperature to which a teacher's distribution of actions is sharpened."""
 _VALUE_LOSSES = {"huber": "smooth_l1", "mean squared error": "l2"}
 _LOSS_NAMES = {
     "loss_objective": "policy loss",
@@ -274,80 +271,3 @@ def _rows(steps: TensorDictBase, order: Tensor) -> TensorDictBase:
     rows = steps.apply(lambda values: values.index_select(0, order), batch_size=order.shape)
     assert rows is not None
     return rows
-
-
-class Distillation(PPO):
-    """PPO that first learns to act like a teacher.
-
-    For `teacher_iterations` the policy's loss is the KL divergence of its distribution of actions from the teacher's,
-    in the states that the policy's own driving leads to (DAgger, Ross et al. 2011). The teacher's distribution is
-    sharpened first, as in policy distillation (Rusu et al. 2015): policies here sample their actions to the end, and
-    their likeliest action is a clearer label than a sampled one. Every step is learned from once, in small minibatches:
-    with labels there is less to gain from a second look than from another step. The value network learns as in PPO,
-    which follows.
-    """
-
-    def __init__(
-        self,
-        actor_critic: ActorCritic,
-        config: PPOConfig,
-        schedule: Schedule,
-        seed: int,
-        teacher: TensorDictModuleBase,
-        device: torch.device = _CPU,
-    ) -> None:
-        """Set up PPO and the teacher, whose weights stay as they are."""
-        super().__init__(actor_critic, config, schedule, seed, device)
-        self._teacher = teacher.to(device)
-        self._imitates = False
-
-    def update(self, batch: TensorDictBase, iteration: int, fraction: float) -> UpdateMetrics:
-        """See `Algorithm.update`; `policy_loss` is the divergence from the teacher, in nats, while it is imitated."""
-        config = self.config
-        self._imitates = iteration < config.teacher_iterations
-        self._epochs, self._batch_size = (
-            (1, config.teacher_batch_size) if self._imitates else (config.epochs, config.batch_size)
-        )
-        return super().update(batch, iteration, fraction)
-
-    @property
-    def _inner_loop(self) -> InnerLoop | None:
-        return None if self._imitates else self._compiled
-
-    def loss(self, minibatch: TensorDictBase) -> TensorDictBase:
-        """Return the losses as PPO does."""
-        if not self._imitates:
-            return super().loss(minibatch)
-        policy = self._learner.policy_head.get_dist(minibatch)
-        teacher = self._learner.policy_head.build_dist_from_params(minibatch["teacher"])
-        value_loss, *_ = self._loss.loss_critic(minibatch)
-        with torch.no_grad():
-            log_ratio = policy.log_prob(minibatch["action"]) - minibatch["action_log_prob"]
-            nothing = torch.zeros((), device=self._device)
-        return TensorDict(
-            {
-                "loss_objective": kl_divergence(teacher, policy).mean(),
-                "loss_critic": value_loss.mean(),
-                "loss_entropy": nothing,
-                "entropy": policy.entropy().detach().mean(),
-                "clip_fraction": nothing,
-                "mean_ratio": log_ratio.exp().mean(),
-                "kl_approx": -log_ratio.mean(),
-            }
-        )
-
-    @torch.no_grad()
-    def _prepare(self, batch: TensorDictBase) -> tuple[TensorDictBase, float]:
-        steps, explained_variance = super()._prepare(batch)
-        if self._imitates:
-            seen = batch.select(*self._teacher.in_keys).reshape(-1)
-            teacher = TensorDict.cat(
-                [self._teacher.get_dist_params(part) for part in seen.split(_PICTURES_AT_ONCE)]
-            )
-            # As if probabilities were raised to the power of 1 / _TEMPERATURE; a Gaussian's become narrower.
-            if "logits" in teacher:
-                sharpened = {"logits": teacher["logits"] / _TEMPERATURE}
-            else:
-                sharpened = {"loc": teacher["loc"], "scale": teacher["scale"] * math.sqrt(_TEMPERATURE)}
-            steps["teacher"] = TensorDict(sharpened, steps.batch_size)
-        return steps, explained_variance

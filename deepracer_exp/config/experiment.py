@@ -77,7 +77,6 @@ class Experiment:
     stopping: StoppingConfig
     budget: BudgetConfig
     tracking: TrackingConfig
-    teacher: Annotated[str, Field(min_length=1)] | None = None
     race: RaceConfig = ALONE
     device: Annotated[str, AfterValidator(_device)] = "cpu"
     trace: Annotated[Literal["full", "laps", "off"], BeforeValidator(_off)] = "full"
@@ -100,15 +99,10 @@ class Experiment:
                     f"stopping.held_out_completion={stopping.held_out_completion:g}: no evaluation on held-out "
                     f"conditions counts with {without}; accepted: null"
                 )
-        imitates = isinstance(algorithm, PPOConfig) and algorithm.teacher_iterations > 0
-        if self.teacher is None and imitates:
-            raise ValueError("teacher: algorithm=distill needs one; accepted: teacher=RUN, a trained run")
         if self.device != "cpu" and isinstance(algorithm, PPOConfig) and algorithm.target is not None:
             raise ValueError(
                 f"device={self.device}: an algorithm of your own chooses where it computes; accepted: device=cpu"
             )
-        if self.teacher is not None and not imitates:
-            raise ValueError("teacher: only algorithm=distill learns from one; accepted: algorithm=distill")
         camera, lidar, network = self.observation.camera, self.observation.lidar, self.network
         if self.race.others and not self.observation.next_objects and camera is None and lidar is None:
             raise ValueError(

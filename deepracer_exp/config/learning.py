@@ -97,8 +97,6 @@ class PPOConfig(AlgorithmConfig):
     entropy_end_factor: NonNegative = 1.0
     critic_coeff: Positive
     compiled: bool = True
-    teacher_iterations: Annotated[int, Field(ge=0, le=10**6)] = 0
-    teacher_batch_size: Annotated[int, Field(ge=1, le=10**6)] = 128
     target: Reference | None = None
     kwargs: dict[str, Any] = field(default_factory=dict)
 
@@ -106,8 +104,6 @@ class PPOConfig(AlgorithmConfig):
         """Refuse arguments for a class that is not named."""
         if self.kwargs and self.target is None:
             raise ValueError("kwargs are arguments of a class of your own; give target=package.module:Class")
-        if self.teacher_iterations and self.target is not None:
-            raise ValueError("teacher_iterations: only PPO learns from a teacher; give target or a teacher")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -45,13 +45,6 @@ class DiscreteActions:
         """Highest [steering_deg, speed_mps] of any action, (2,)."""
         return np.array([self.steering_deg.max(), self.speed_mps.max()])
 
-    @property
-    def scaled(self) -> NDArray[np.float64]:
-        """Steering and speed of each action as a continuous space of the same range has them, -1 to 1, (n, 2)."""
-        range_of = self.high - self.low
-        commands = np.stack([self.steering_deg, self.speed_mps], axis=1)
-        return 2 * (commands - self.low) / np.where(range_of > 0, range_of, np.inf) - (range_of > 0)
-
     def commands(self, action: NDArray[Any]) -> Commands:
         """Look up the commands of N action numbers, (N,) integers from 0 to n - 1."""
         return self.steering_deg[action], self.speed_mps[action]

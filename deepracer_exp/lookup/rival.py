@@ -1,13 +1,13 @@
 """The run whose policy drives the rivals of a race head to head."""
 
+import shutil
 from pathlib import Path
 
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.action_space import build_action_space, describe_actions
 from deepracer_exp.errors import BadInput
-from deepracer_exp.runs.files import RIVAL
+from deepracer_exp.runs.files import CHECKPOINTS, CONFIG, RIVAL
 
-from .kept import kept_run
 from .resolve import StoredRun, resolve
 
 
@@ -47,13 +47,33 @@ def find_rival(
     return stored
 
 
-def kept_rival(experiment: Experiment, run_dir: Path) -> StoredRun | None:
-    """Return the other run whose policy is kept in a run's folder as its rival; None: it has none.
+def keep_rival(rival: StoredRun, run_dir: Path) -> None:
+    """Copy a rival's configuration and checkpoint into a run's folder, so that it is resumed wherever it is moved.
 
     Raises:
-        BadInput: as for `kept_run`.
+        OSError: they cannot be copied.
+    """
+    assert rival.checkpoint is not None
+    target = run_dir / RIVAL
+    shutil.copytree(rival.checkpoints / rival.checkpoint, target / CHECKPOINTS / rival.checkpoint)
+    shutil.copy(rival.path / CONFIG, target / CONFIG)
+
+
+def kept_rival(experiment: Experiment, run_dir: Path) -> StoredRun | None:
+    """Return the other run whose policy `keep_rival` has copied into a run's folder; None: it has none.
+
+    Raises:
+        BadInput: the copy is missing, or as for `StoredRun.with_policy`.
     """
     config = experiment.race.rivals
     if config is None or config.is_own:
         return None
-    return kept_run(run_dir / RIVAL)
+    kept = StoredRun(run_dir / RIVAL)
+    try:
+        (checkpoint,) = kept.checkpoints.iterdir()
+    except (OSError, ValueError) as error:
+        raise BadInput(
+            kept.checkpoints,
+            "is not one checkpoint, which a run with another one's policy as its rival has there",
+        ) from error
+    return kept.with_policy(checkpoint.name)

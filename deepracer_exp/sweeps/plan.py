@@ -38,7 +38,7 @@ def plan_sweep(overrides: Sequence[str], *, is_only_shown: bool = False) -> Swee
     """
     request, study = compose_sweep(overrides), None
     # Files and options that all trials share; the values of the search are checked with its space, which needs Optuna.
-    shared = (*groups(), custom_files.KEY, "teacher", "runs_dir")
+    shared = (*groups(), custom_files.KEY, "runs_dir")
     named = [line for line in request.base if (key := key_of(line)) in shared or key.endswith(".file")]
     remarks = plan_training(*compose_experiment(named)).files.remarks
     if not (is_only_shown and request.space):

@@ -100,8 +100,4 @@ def _changed(parent: StoredRun, changes: Sequence[str], stored: bool) -> Composi
         composition.mapping["algorithm"]["lr"] = parent.experiment.algorithm.lr * SLOWER
     if "runs_dir" not in keys:
         composition.mapping["runs_dir"] = str(parent.path.parent.parent)
-    if parent.experiment.teacher is not None and "teacher" not in keys:
-        # The parent has already learned from it.
-        composition.mapping["teacher"] = None
-        composition.mapping["algorithm"]["teacher_iterations"] = 0
     return composition

@@ -11,7 +11,7 @@ from deepracer_exp.config.parse import import_own_classes, parse_experiment
 from deepracer_exp.config.stored import with_overrides
 from deepracer_exp.env.files import RaceFiles, read_race_files
 from deepracer_exp.env.real_car import require_car
-from deepracer_exp.lookup.resolve import StoredRun, resolve
+from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.lookup.rival import find_rival
 from deepracer_exp.runs.files import PROVENANCE, read_config, read_object
 
@@ -26,8 +26,6 @@ class TrainPlan:
     composition: Composition
     """Where the values of the experiment came from."""
     files: RaceFiles
-    teacher: StoredRun | None
-    """The run, with its checkpoint, whose policy the new one learns from; None: there is none."""
     rival: StoredRun | None
     """The run, with its checkpoint, whose policy drives the rivals; None: there are none, or they are the run's own."""
     parent: StoredRun | None = None
@@ -37,25 +35,23 @@ class TrainPlan:
 def plan_training(
     experiment: Experiment, composition: Composition, parent: StoredRun | None = None
 ) -> TrainPlan:
-    """Read the files of an experiment and find its teacher and rival; `compose_experiment` returns both arguments.
+    """Read the files of an experiment and find its rival; `compose_experiment` returns both arguments.
 
     Raises:
         BadInput: a file is missing or malformed, there is no such run, the rival has other actions, or the car that the
             evaluation asks for could not run the policy.
     """
     files = read_race_files(experiment)
-    teacher = rival = None
+    rival = None
     if experiment.evaluation.real_car is not None:
         require_car(experiment)
     if experiment.randomization.real_car is not None:
         require_car(experiment, "randomization.real_car")
     runs_dir, uri = Path(experiment.runs_dir), getattr(experiment.tracking, "uri", None)
-    if experiment.teacher is not None:
-        teacher = resolve(experiment.teacher, runs_dir, uri).with_policy()
     rivals = experiment.race.rivals
     if rivals is not None and not rivals.is_own:
         rival = find_rival("race.rivals.policy", rivals.policy, rivals.checkpoint, experiment, runs_dir, uri)
-    return TrainPlan(experiment, composition, files, teacher, rival, parent)
+    return TrainPlan(experiment, composition, files, rival, parent)
 
 
 @dataclass(frozen=True)

@@ -26,10 +26,9 @@ from deepracer_exp.config.parse import parse_config
 from deepracer_exp.config.running import BudgetConfig
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.errors import NO_MEMORY, BadInput, RunFailed, count, is_refused_memory, reading
-from deepracer_exp.lookup.kept import keep_policy
 from deepracer_exp.lookup.next_steps import schedule_until
 from deepracer_exp.lookup.resolve import StoredRun
-from deepracer_exp.lookup.rival import kept_rival
+from deepracer_exp.lookup.rival import keep_rival, kept_rival
 from deepracer_exp.rewards.reward import RewardFunction
 from deepracer_exp.runs.checkpoints import check, checkpoint_name, intact_checkpoint, read_training
 from deepracer_exp.runs.files import (
@@ -38,9 +37,7 @@ from deepracer_exp.runs.files import (
     LINEAGE,
     METRICS,
     REWARD,
-    RIVAL,
     SUMMARY,
-    TEACHER,
     TRACKING,
     read_object,
 )
@@ -65,7 +62,6 @@ from .metrics import track_names
 from .plan import ResumePlan, TrainPlan
 from .rounding import rounded
 from .signals import Interruption
-from .teacher import check_teacher
 from .trainer import Trainer
 
 logger = logging.getLogger("deepracer_exp")
@@ -187,10 +183,8 @@ def _begin(
     created: Callable[[Path], None] | None = None,
 ) -> Trainer:
     """Create the folder of a new run and record it."""
-    experiment, composition, teacher, rival = plan.experiment, plan.composition, None, None
+    experiment, composition, rival = plan.experiment, plan.composition, None
     refuse_spent(experiment.budget, Path(experiment.runs_dir) / experiment.name)
-    if plan.teacher is not None:
-        teacher = check_teacher(plan.teacher, experiment)
     if plan.rival is not None:
         rival = StoredRun(plan.rival.path, plan.rival.read_policy().path.name)
     tracker = open_tracker(experiment.tracking, Path(experiment.runs_dir))
@@ -202,10 +196,8 @@ def _begin(
         label += f"-clone{lineage.generation}"
     folder = RunFolder.create(experiment.runs_dir, experiment.name, label)
     try:
-        if teacher is not None:
-            keep_policy(teacher, folder.path / TEACHER)
         if rival is not None:
-            keep_policy(rival, folder.path / RIVAL)
+            keep_rival(rival, folder.path)
         trainer = Trainer(experiment, setup, folder, composition.mapping, every)
         if start is not None:
             trainer.agent.begin_with(start[0])
@@ -229,8 +221,6 @@ def _begin(
     acting.remember()
     for note in (*composition.notes, *plan.files.remarks):
         logger.info(note)
-    if teacher is not None:
-        logger.info("teacher: %s, checkpoint %s", teacher.path, teacher.checkpoint)
     if rival is not None:
         logger.info("rival: %s, checkpoint %s", rival.path, rival.checkpoint)
     tracker.open(folder.path, _described(trainer, composition, names, commit, run_name, tags))

@@ -43,7 +43,6 @@ from .callback import Callback, TrainResult
 from .metrics import NOT_EVALUATED, Finished, RunMetrics, track_names
 from .rivals import RivalPool
 from .signals import Interruption
-from .teacher import read_teacher
 
 logger = logging.getLogger("deepracer_exp")
 
@@ -122,7 +121,6 @@ class Trainer:
             experiment.algorithm,
             experiment.lr_schedule,
             experiment.seed,
-            None if experiment.teacher is None else read_teacher(folder.path),
             torch.device(experiment.device),
         )
         self.agent.threads = share or cores()

@@ -32,9 +32,8 @@ def composed(group: str, name: str) -> tuple[Experiment, Composition]:
     reads = {"lidar": "lidar", "deep": "camera"}.get(name, "camera_small")
     reads = "features" if name.startswith("mlp") else reads
     sees = [f"observation={reads}"] if group == "network" else []
-    teacher = ["teacher=a_run"] if name == "distill" else []
     sees += ["observation.next_objects=2"] if group == "race" else []
-    return compose_experiment([*sees, *teacher, f"{group}={name}"])
+    return compose_experiment([*sees, f"{group}={name}"])
 
 
 def test_the_groups_are_the_fields_of_an_experiment():
@@ -47,7 +46,6 @@ def test_the_groups_are_the_fields_of_an_experiment():
         "runs_dir",
         "debug",
         "report",
-        "teacher",
         "trace",
     }
 

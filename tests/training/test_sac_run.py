@@ -126,7 +126,6 @@ def test_a_clone_begins_with_policy_and_critics_and_an_empty_replay(copied, call
         (("algorithm.epochs=3",), ("algorithm.epochs", "no such key")),
         (("lr_schedule=adaptive_kl",), ("lr_schedule=adaptive_kl", "linear")),
         (("network=mlp_small_shared",), ("network.shared_trunk=true", "accepted: false")),
-        (("teacher=somewhere",), ("teacher", "algorithm=distill")),
         (("algorithm.tau=0",), ("algorithm.tau=0",)),
         (("algorithm.batch_size=511", "algorithm.value_network=true"), ("batch_size=511", "even")),
         (
