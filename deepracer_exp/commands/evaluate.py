@@ -234,7 +234,6 @@ def _watch(args: argparse.Namespace) -> int:
 
         from deepracer_exp.reports.watch import film_run
 
-
         file = None if args.output is None else Path(args.output)
         with warnings_on_stderr():
             film_run(

@@ -24,15 +24,12 @@ def rounded(experiment: Experiment) -> list[str]:
     # Soft actor-critic draws its minibatches from a replay, and a class of the user's own may do anything.
     if not isinstance(algorithm, PPOConfig) or algorithm.target is not None:
         return lines
-    sizes = {"batch_size": algorithm.batch_size}
-    if algorithm.teacher_iterations:
-        sizes["teacher_batch_size"] = algorithm.teacher_batch_size
-    for key, size in sizes.items():
-        if size > frames:
-            lines.append(f"algorithm.{key}={size}: a minibatch has {frames:,} steps, all of an iteration")
-        elif left_out := frames % size:
-            lines.append(
-                f"algorithm.{key}={size}: each pass leaves out {left_out:,} of an iteration's {frames:,} steps, "
-                "others each time"
-            )
+    size = algorithm.batch_size
+    if size > frames:
+        lines.append(f"algorithm.batch_size={size}: a minibatch has {frames:,} steps, all of an iteration")
+    elif left_out := frames % size:
+        lines.append(
+            f"algorithm.batch_size={size}: each pass leaves out {left_out:,} of an iteration's {frames:,} steps, "
+            "others each time"
+        )
     return lines

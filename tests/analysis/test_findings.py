@@ -564,7 +564,7 @@ def test_zig_zag_is_named_from_a_twentieth_of_a_second_a_lap_on() -> None:
     for lost_s, named in ((0.04, False), (0.2, True)):
         own = replace(view, run=run_of(view, evaluations=evaluations.assign(zigzag_lost_s=lost_s)))
         assert ("zigzag" in [one.rule for one in findings(own)]) == named
-    assert "algorithm.smoothness" in of(own, "zigzag").sentence
+    assert "an action space with smaller angles" in of(own, "zigzag").sentence
 
 
 def chart_of(view: LogView, name: str) -> Chart:

@@ -24,6 +24,10 @@ CARS = ("experiment=tiny", "collector.cars=16")
                 "algorithm.batch_size=300: each pass leaves out 108 of an iteration's 1,008 steps, others each time",
             ],
         ),
+        (
+            ("algorithm.frames_per_iteration=1008", "algorithm.batch_size=9000"),
+            ["algorithm.batch_size=9000: a minibatch has 1,008 steps, all of an iteration"],
+        ),
         (("algorithm.frames_per_iteration=null", "algorithm.episodes_per_iteration=20"), []),
     ],
 )
@@ -36,14 +40,3 @@ def test_soft_actor_critic_draws_its_minibatches_from_what_it_remembers():
     assert rounded(compose_experiment(sac)[0]) == []
     (line,) = rounded(compose_experiment([*sac, "algorithm.frames_per_iteration=1000"])[0])
     assert line.startswith("algorithm.frames_per_iteration=1000: each iteration has 1,008 steps")
-
-
-def test_the_minibatches_of_an_imitated_teacher_are_looked_at_too():
-    distill = ("algorithm=distill", "teacher=someone")
-    assert rounded(compose_experiment(distill)[0]) == []
-    assert rounded(compose_experiment([*distill, "algorithm.teacher_batch_size=500"])[0]) == [
-        "algorithm.teacher_batch_size=500: each pass leaves out 192 of an iteration's 8,192 steps, others each time"
-    ]
-    assert rounded(compose_experiment([*distill, "algorithm.teacher_batch_size=9000"])[0]) == [
-        "algorithm.teacher_batch_size=9000: a minibatch has 8,192 steps, all of an iteration"
-    ]

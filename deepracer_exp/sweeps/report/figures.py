@@ -99,7 +99,7 @@ def _drawn(study: optuna.Study) -> "Iterator[tuple[str, str, go.Figure]]":
         names = [MEASURES[objectives[index]].label for index in pair]
         front = visualization.plot_pareto_front(
             study,
-            targets=lambda trial, pair=pair: [trial.values[index] for index in pair],
+            targets=_values(pair),
             target_names=names,
         )
         yield (
@@ -107,6 +107,10 @@ def _drawn(study: optuna.Study) -> "Iterator[tuple[str, str, go.Figure]]":
             "Pareto front: no other trial is better in every objective",
             front.update_xaxes(range=ranges[pair[0]]).update_yaxes(range=ranges[pair[1]]),
         )
+
+
+def _values(indices: Sequence[int]) -> Target:
+    return lambda trial: [trial.values[index] for index in indices]
 
 
 def _value(index: int, sign: float) -> Target:
