@@ -203,7 +203,6 @@ def test_a_study_of_a_stranger_imports_nothing_and_ones_own_resumes(run_at, acco
 
 STORED = {
     "budget.alert_command=say": "budget.alert_command=say",
-    "budget.alert_webhook=HOOK": "budget.alert_webhook=HOOK",
     "tracking.uri=http://evil:5000": "tracking.uri=http://evil:5000",
     "tracking=wandb": "tracking.project=",
     "sweep.storage=postgresql+psycopg://evil/studies": "sweep.storage=",

@@ -30,7 +30,6 @@ RESULTS: tuple[tuple[str, str, str, int], ...] = (
     ("end", "end", "{}", 0),
     ("control steps", "last env_steps", "{:,.0f}", 0),
     ("minutes", "minutes", "{:.1f}", 0),
-    ("cost", "cost", "{:.2f}", 0),
     ("best checkpoint", "iteration", "{:06d}", 0),
     *FIGURES,
     ("exploring laps", "last laps", "{:,.0f}", 1),
@@ -56,7 +55,6 @@ def _values(record: RunRecord) -> dict[str, Any]:
     seconds, share = last.get("wall_clock_s"), last.get("lap_share")
     return {
         "end": summary.get("reason") or "running, or was killed",
-        "cost": summary.get("cost"),
         "minutes": None if seconds is None else seconds / 60,
         "exploring laps_percent": None if share is None else 100 * share,
         **{moment: (summary.get(moment) or {}).get("env_steps") for moment in ("first_lap", "reliable")},

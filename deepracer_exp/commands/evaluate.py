@@ -256,7 +256,7 @@ def _watch(args: argparse.Namespace) -> int:
         from deepracer_exp.reports.live import serve_live
         from deepracer_exp.training.budget import Budget
 
-        used = Budget(plan.run.experiment.budget, plan.run.path).used
+        used = Budget(plan.run.experiment.budget).used
         serve_live(plan.run, plan.config.evaluation, server, used)
     return 0
 

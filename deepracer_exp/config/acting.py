@@ -22,7 +22,6 @@ from deepracer_exp.files import read_bytes
 REWARD = "reward.file"
 _PLAIN_TRACKING = {"kind": "mlflow", "uri": None}
 """Taken in place of a stored tracking that is not the user's own."""
-_ALERTS = ("alert_command", "alert_webhook")
 _named: dict[str, str] = {}
 """Values that this command's user has named: the text of each value, and its mark in the record of this account."""
 
@@ -66,9 +65,8 @@ def acting(config: Mapping[str, Any]) -> Iterator[Acting]:
     if isinstance(file, str):
         yield reward_file(file)
     budget = _part(config, "budget")
-    for name in _ALERTS:
-        if isinstance(budget.get(name), str):
-            yield Acting(f"budget.{name}", budget[name])
+    if isinstance(budget.get("alert_command"), str):
+        yield Acting("budget.alert_command", budget["alert_command"])
     tracking = _part(config, "tracking")
     if tracking.get("uri") is not None:
         yield Acting("tracking.uri", str(tracking["uri"]))

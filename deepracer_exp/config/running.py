@@ -10,7 +10,6 @@ from .own_class import OURS_OR_OWN, OwnClass
 
 Newest = Annotated[int, Field(ge=1, le=100_000)]
 Percent = Annotated[int, Field(ge=1, le=100)]
-EnvironmentVariable = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 _FEWEST_CARS = 4
 
 
@@ -93,24 +92,11 @@ class BudgetConfig:
     env_steps: Count | None
     iterations: Count | None
     minutes: Positive | None
-    max_cost: Positive | None
-    experiment_env_steps: Count | None
-    experiment_minutes: Positive | None
-    experiment_max_cost: Positive | None
-    price_per_hour: Positive | None
     alerts: tuple[Percent, ...]
     alert_command: Annotated[str, Field(min_length=1)] | None
-    alert_webhook: EnvironmentVariable | None
     schedule_until: Positive = 1.0
 
     def __post_init__(self) -> None:
-        """Refuse a run without an end, and a limit of cost without a price."""
-        ends = ("env_steps", "iterations", "minutes", "max_cost")
-        limits = (*ends, *(f"experiment_{name}" for name in ends if name != "iterations"))
-        if all(getattr(self, name) is None for name in limits):
-            raise ValueError(f"{', '.join(limits)} are all null; at least one must end the run")
-        for name in ("max_cost", "experiment_max_cost"):
-            if getattr(self, name) is not None and self.price_per_hour is None:
-                raise ValueError(
-                    f"{name} is {getattr(self, name):g} but price_per_hour is null; give the price as well"
-                )
+        """Refuse a run without an end."""
+        if self.env_steps is None and self.iterations is None and self.minutes is None:
+            raise ValueError("env_steps, iterations and minutes are all null; at least one must end the run")

@@ -189,10 +189,6 @@ class BudgetCallback(Callback):
         """Wait for alerts still on their way."""
         self._alerts.close()
 
-    def summary(self, trainer: Trainer) -> dict[str, Any]:
-        """Return the cost."""
-        return {"cost": trainer.budget.cost(trainer.wall_clock_s)}
-
     def _check(self, trainer: Trainer) -> None:
         limit, fraction = trainer.budget.used(*trainer.usage)
         if fraction >= 1:

@@ -53,7 +53,7 @@ from deepracer_exp.tracking.metadata import joined, lineage_tags, run_params, ru
 from deepracer_exp.tracking.metrics import now_ms
 from deepracer_exp.tracking.tracking_file import TrackedRun, begin_again, read_tracked_run
 
-from .budget import Budget, refuse_spent
+from .budget import Budget
 from .callback import Callback, TakenOver, TrainResult
 from .callbacks import standard_callbacks
 from .clone import describe_clone, read_parent
@@ -184,7 +184,6 @@ def _begin(
 ) -> Trainer:
     """Create the folder of a new run and record it."""
     experiment, composition, rival = plan.experiment, plan.composition, None
-    refuse_spent(experiment.budget, Path(experiment.runs_dir) / experiment.name)
     if plan.rival is not None:
         rival = StoredRun(plan.rival.path, plan.rival.read_policy().path.name)
     tracker = open_tracker(experiment.tracking, Path(experiment.runs_dir))
@@ -332,7 +331,7 @@ def _forget_damaged_best(run_dir: Path, state: dict[str, Any]) -> None:
 def _moved_schedules(trainer: Trainer, plan: ResumePlan) -> str | None:
     """Return a line on rates that another budget changes at once, and on what holds them; None: there are none."""
     before, now = parse_config(dict(plan.stored["budget"]), BudgetConfig), plan.experiment.budget
-    budgets = [Budget(config, plan.run_dir) for config in (before, now)]
+    budgets = [Budget(config) for config in (before, now)]
     old, new = (
         trainer.agent.rates(trainer.iteration, budget.scheduled(*trainer.usage)) for budget in budgets
     )
@@ -417,15 +416,12 @@ def _own_error(error: Exception, experiment: Experiment) -> str | None:
 def _differences_to_uninterrupted(experiment: Experiment, setup: RaceSetup) -> list[str]:
     """Return why a resumed run cannot equal an uninterrupted one bit for bit."""
     why = []
-    clocks = ("minutes", "max_cost", "experiment_minutes", "experiment_max_cost", "experiment_env_steps")
-    by_clock = [name for name in clocks if getattr(experiment.budget, name) is not None]
+    by_clock = experiment.budget.minutes is not None
     if by_clock and getattr(experiment.lr_schedule, "by", "fraction") == "fraction":
-        why.append(f"the learning rate follows the clock (budget.{by_clock[0]}, lr_schedule.by=fraction)")
+        why.append("the learning rate follows the clock (budget.minutes, lr_schedule.by=fraction)")
     algorithm = experiment.algorithm
     if by_clock and isinstance(algorithm, PPOConfig) and algorithm.entropy_end_factor != 1:
-        why.append(
-            f"the entropy bonus follows the clock (budget.{by_clock[0]}, algorithm.entropy_end_factor)"
-        )
+        why.append("the entropy bonus follows the clock (budget.minutes, algorithm.entropy_end_factor)")
     if any(isinstance(node, ast.Global) for node in ast.walk(ast.parse(setup.reward.text))):
         why.append(
             f"the reward function {setup.reward.name} keeps something in a global variable, which is lost"

@@ -95,7 +95,7 @@ class Trainer:
         self.callbacks = callbacks
         kept = experiment.checkpoints
         self.checkpoints = CheckpointStore(folder.path, kept.keep, kept.every)
-        self.budget = Budget(experiment.budget, folder.path)
+        self.budget = Budget(experiment.budget)
         collector = experiment.collector
         self.metrics = RunMetrics(
             track_names(setup), collector.cars, experiment.car.control_period_s, experiment.stopping

@@ -93,7 +93,6 @@ def test_the_fastest_is_the_best_and_what_no_run_has_is_left_out(record):
     assert table["exploring laps"] == (["20", "20"], None)
     assert table["control steps"][1] is None
     assert "mean usual lap, s" not in table
-    assert "cost" not in table
 
 
 def test_long_values_are_shortened_in_their_middle():

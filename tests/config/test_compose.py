@@ -201,7 +201,7 @@ def test_a_value_of_the_wrong_kind_is_named_with_what_would_do(override, accepte
         (["car.rear_axle_x_m=1"], ["1.0", "0.082311"]),
         (["reward.time_limit_s=30"], ["30", "20"]),
         (["observation=camera", "network.kernels=[1]"], ["network: filters, kernels and strides"]),
-        (["budget.env_steps=null"], ["env_steps", "iterations", "minutes", "max_cost"]),
+        (["budget.env_steps=null"], ["env_steps", "iterations", "minutes"]),
     ],
 )
 def test_values_that_contradict_each_other_are_both_named(overrides, both):

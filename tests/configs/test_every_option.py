@@ -124,7 +124,7 @@ def test_every_schedule_gives_a_rate(name):
 
 @pytest.mark.parametrize("name", options("budget"))
 def test_every_budget_ends_a_run(name):
-    budget = Budget(composed("budget", name)[0].budget, Path())
+    budget = Budget(composed("budget", name)[0].budget)
     assert budget.used(0, 0, 0.0)[1] == 0
     assert budget.used(10**12, 10**9, 1e12)[1] >= 1
 

@@ -28,7 +28,7 @@ SQUARE = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]])
         (["collector.cars=2000"], ["algorithm.frames_per_iteration=1024", "collector.cars=2000"]),
         (["algorithm.episodes_per_iteration=5"], ["frames_per_iteration=1024", "episodes_per_iteration=5"]),
         (["collector.processes=3"], ["collector.processes=3", "collector.mode=in_process"]),
-        (["budget.env_steps=null"], ["env_steps", "iterations", "minutes", "max_cost"]),
+        (["budget.env_steps=null"], ["env_steps", "iterations", "minutes"]),
         (["=1"], ["=1"]),
         (["seed=[1"], ["seed=[1"]),
     ],

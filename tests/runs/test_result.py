@@ -11,7 +11,7 @@ from deepracer_exp.runs.result import Ending, fastest_reliable, result_of, why_n
     ("ending", "words"),
     [
         (Ending.by_rule("not_learning", "no lap", "stopped early"), "stopped early: not learning: no lap"),
-        (Ending.by_budget("experiment_minutes"), "finished: budget reached: experiment_minutes"),
+        (Ending.by_budget("minutes"), "finished: budget reached: minutes"),
         (Ending("interrupted", "by Ctrl-C"), "interrupted: by Ctrl-C"),
     ],
 )

@@ -64,18 +64,6 @@ def test_a_budgets_alerts_go_to_the_log_and_the_command(trained, tmp_path):
     assert all(message in log for message in sent)
 
 
-def test_runs_of_an_experiment_share_its_budget_to_the_end(train_here):
-    shared = ("budget.env_steps=2048", "budget.experiment_env_steps=3072", "budget.price_per_hour=3600")
-    first = train_here(*shared)
-    assert (first.summary["reason"], first.summary["env_steps"]) == ("budget reached: env_steps", 2048)
-    assert first.summary["cost"] == pytest.approx(first.summary["wall_clock_s"], abs=0.1)  # 1 a second
-    second = read_record(train_here(*shared).folders[1]).summary
-    assert (second["reason"], second["env_steps"]) == ("budget reached: experiment_env_steps", 1024)
-    third = train_here(*shared)
-    third.assert_refused("budget.experiment_env_steps=3072: the runs in runs/tiny have used 3,072 already")
-    assert len(third.folders) == 2
-
-
 def ctrl_c_after(iterations, folder) -> None:
     """Send Ctrl-C to this process as soon as a run below a folder has as many iterations."""
 
