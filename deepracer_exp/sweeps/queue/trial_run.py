@@ -50,6 +50,8 @@ from .worker_config import RUN_ID, WorkerConfig, plan_trial
 
 Value = TypeVar("Value")
 
+_KEEPS = {"report": "false", "trace": "laps"}
+"""What a trial's run keeps, unless its overrides say otherwise: traces of all steps were two thirds of a study's disk."""
 _MOST_TRIES = 3
 """How often a run is started or resumed at the same checkpoint if its process is lost each time."""
 _STATES = {FAILED: "FAIL", STOPPED_EARLY: "PRUNED"}
@@ -234,7 +236,7 @@ class TrialRun(Callback):
             where = ["collector.mode=in_process", "collector.processes=null"]
         if "collector.threads" not in keys:
             where.append(f"collector.threads={self._config.cores}")
-        lines += where if "report" in keys else [*where, "report=false"]
+        lines += [*where, *(f"{key}={value}" for key, value in _KEEPS.items() if key not in keys)]
         plan = self._planned(lines)
         experiment = plan.experiment
         if experiment.observation.camera is not None:
