@@ -40,9 +40,10 @@ from typing import Any
 
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.stopping import StoppingConfig
+from deepracer_exp.env.action_space import build_action_space
+from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.checkpoints import checkpoint_name, read_training
-from deepracer_exp.runs.files import read_record
-from deepracer_exp.stopping.backtest import backtest
+from deepracer_exp.stopping.rules import Decision, build_rule
 from deepracer_exp.training.metrics import NOT_EVALUATED
 
 from .command import at_once, read_metrics, read_summary, trained
@@ -103,23 +104,33 @@ def prove(full: Path, stopped: Path, iteration: int, kept: str) -> dict[str, Any
     return {"run": stopped.name, "iteration": iteration, "kept": int(kept), "same_metrics": True}
 
 
+def replay(run: Path, rule: StoppingConfig) -> tuple[Decision | None, list[dict[str, Any]]]:
+    """Return the decision by which a rule would have ended a run, and the rows of its metrics until then."""
+    rows = read_metrics(run)
+    stopping = build_rule(rule, build_action_space(StoredRun(run).experiment.action_space).n)
+    for place, row in enumerate(rows):
+        if (decision := stopping.observe(row)) is not None:
+            return decision, rows[: place + 1]
+    return None, rows
+
+
 def measure(run: Path, rule: StoppingConfig, trials: int = TRIALS) -> dict[str, Any]:
     """Apply the rule to a full run and let both checkpoints drive."""
-    record = read_record(run)
-    end = backtest(record, rule, RULE)
+    decision, until = replay(run, rule)
+    end, last = until[-1], read_metrics(run)[-1]
     # A run that ends is raced once more: the best of the full run may be its last policy.
     best = (run / "checkpoints" / "best").resolve().name
-    kept = best if end.iteration == end.iterations else best_within(run, end.iteration)
+    kept = best if end["iteration"] == last["iteration"] else best_within(run, end["iteration"])
     names = dict.fromkeys((kept, best))
     driven = dict(zip(names, drive(run, list(names), trials), strict=True))
     return {
         "run": run.name,
-        "rule": None if end.decision is None else end.decision.rule,
-        "iteration": end.iteration,
-        "iterations": end.iterations,
-        "env_steps": end.env_steps,
-        "saved_steps": end.saved_steps,
-        "saved": round(end.saved, 4),
+        "rule": None if decision is None else decision.rule,
+        "iteration": end["iteration"],
+        "iterations": last["iteration"],
+        "env_steps": end["env_steps"],
+        "saved_steps": last["env_steps"] - end["env_steps"],
+        "saved": round(1 - end["env_steps"] / last["env_steps"], 4),
         "kept": int(kept),
         "full": int(best),
         "lap_time_loss": lap_time_loss(driven[kept], driven[best]),

@@ -66,7 +66,7 @@ def test_version_is_the_packages(call):
 
 COMMANDS = (
     *("train", "resume", "clone", "sweep", "runs", "ui", "evaluate", "check", "watch"),
-    *("checkpoints", "stopping", "analyze", "compare", "validate", "import", "export", "tracks"),
+    *("checkpoints", "analyze", "compare", "validate", "import", "export", "tracks"),
 )
 
 

@@ -63,7 +63,7 @@ def test_the_configuration_page_has_every_group_and_option_and_the_default_in_bo
 
 def test_the_page_of_commands_has_every_command():
     headings = set(re.findall(r"^## (.+)$", _reference().commands_page(), re.MULTILINE))
-    assert {"train", "evaluate", "compare", "runs clean", "sweep", "stopping replay", "ui"} <= headings
+    assert {"train", "evaluate", "compare", "runs clean", "sweep", "ui"} <= headings
 
 
 def test_the_site_lists_every_page():

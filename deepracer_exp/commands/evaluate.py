@@ -1,4 +1,4 @@
-"""`deepracer-exp evaluate`, `check`, `watch`, `checkpoints` and `stopping`: how good a run is, when it should end."""
+"""`deepracer-exp evaluate`, `check`, `watch` and `checkpoints`: how good a run is."""
 
 import argparse
 import ctypes.util
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from deepracer_exp.errors import BadInput
 
-from .arguments import add_command, add_run, port, run_and_overrides, runs_and_overrides, split_stores
+from .arguments import add_command, add_run, port, run_and_overrides, runs_and_overrides
 from .output import check_file, plain_console, table_console, warnings_on_stderr
 from .pages import add_replay, write_laps
 
@@ -116,23 +116,6 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument(
         "-o", "--output", metavar="FILE", help="page to write (.html): the table, figures and all laps"
     )
-
-    parser = commands.add_parser(
-        "stopping",
-        help="try a stopping rule on finished runs",
-        description="Try stopping rules on finished runs.",
-    )
-    actions = parser.add_subparsers(metavar="ACTION", required=True)
-    replay = add_command(
-        actions,
-        "replay",
-        _replay,
-        help="show where a rule would have ended runs, what it saves and what it loses",
-        description="Apply a stopping rule to the metrics of runs: where would it have ended them, what would that "
-        "have saved, and how much better did they still become?",
-        epilog=_STOPPING_EPILOG,
-    )
-    add_run(replay, "stopping=NAME | stopping.KEY=VALUE", many=True)
 
 
 def _evaluate(args: argparse.Namespace) -> int:
@@ -352,44 +335,3 @@ def _checkpoints(args: argparse.Namespace) -> int:
             plan.run, plan.config.evaluation, args.output, table_console(160), progress, plan.rival
         )
     return 0
-
-
-_STOPPING_EPILOG = """\
-  deepracer-exp stopping replay RUN                           the rule `entropy` with its default values
-  deepracer-exp stopping replay RUN RUN stopping=plateau      another rule
-  deepracer-exp stopping replay RUN stopping.converged.patience=40,80
-                                                              other values, one after the other
-"""
-
-
-def _replay(args: argparse.Namespace) -> int:
-    from deepracer_exp.config.compose import compose_experiment, expand_grid
-    from deepracer_exp.runs.files import read_record
-
-    runs, words = runs_and_overrides(args)
-    stores, overrides = split_stores(words)
-    for override in overrides:
-        if not override.startswith(("stopping=", "stopping.")):
-            raise BadInput(f"{override}: accepted: stopping=NAME and stopping.KEY=VALUE")
-    if not runs:
-        raise BadInput("RUN: missing; accepted: a run's folder, or its name in runs/EXPERIMENT/")
-    if not any(override.startswith("stopping=") for override in overrides):
-        overrides.insert(0, "stopping=entropy")
-    records = [read_record(stores.find(run).path) for run in runs]
-
-    from deepracer_exp.stopping.backtest import backtest, table
-
-    rules = [
-        (" ".join(map(_within_group, lines)), compose_experiment(lines)[0])
-        for lines in expand_grid(overrides)
-    ]
-    backtests = [backtest(record, config.stopping, rule) for record in records for rule, config in rules]
-    table_console().print(table(backtests))
-    return 0
-
-
-def _within_group(line: str) -> str:
-    """Return an override without its group: ``plateau``, ``converged.patience=40``."""
-    key, _, value = line.partition("=")
-    _, _, inside = key.partition(".")
-    return f"{inside}={value}" if inside else value

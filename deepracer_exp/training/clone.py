@@ -29,7 +29,13 @@ if TYPE_CHECKING:
 
 SLOWER = 0.1
 """A clone's learning rate over its parent's, where none is given: what racers do with a good model."""
-_AS_USUAL = ("report=true", "trace=full", "collector.mode=sync", "collector.processes=null", "collector.threads=0")
+_AS_USUAL = (
+    "report=true",
+    "trace=full",
+    "collector.mode=sync",
+    "collector.processes=null",
+    "collector.threads=0",
+)
 """Settings for the clone of a sweep's trial, which had one core, no report and a trace of laps alone."""
 _ALLOWED = {
     "track": "the policy has to find its way on another road",

@@ -13,11 +13,11 @@ from deepracer_exp.analysis.findings import findings
 from deepracer_exp.analysis.log_tables import headline
 from deepracer_exp.analysis.log_view import prepare
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.setup import build_courses
 from deepracer_exp.reports.run_page import write_pictures
-from deepracer_exp.runs.files import read_record
 from deepracer_exp.runs.recording import read_run_recording
-from deepracer_exp.stopping.backtest import backtest
+from deepracer_exp.stopping.rules import build_rule
 from tests.waiting import wait_until
 
 NOT_LEARNING = (
@@ -40,13 +40,13 @@ def test_a_run_that_does_not_learn_is_stopped_early(trained):
     assert 0.99 < stopping["values"]["entropy"] <= 1
 
 
-def test_the_replay_of_a_run_comes_to_the_runs_own_decision(trained, copied, call):
+def test_the_rule_comes_to_the_runs_decision_by_the_rows_of_its_metrics_alone(trained):
     ended = trained(*NOT_LEARNING)
-    found = backtest(read_record(ended.folder), compose_experiment(NOT_LEARNING)[0].stopping, "")
-    assert found.iteration == ended.summary["iteration"]
-    assert found.decision.as_dict() == ended.summary["stopping"]
-    assert found.saved_steps == 0
-    assert "continues to the end" in call("stopping", "replay", str(ended.folder), "stopping=plateau").stdout
+    experiment = compose_experiment(NOT_LEARNING)[0]
+    rule = build_rule(experiment.stopping, build_action_space(experiment.action_space).n)
+    *before, last = [rule.observe(row) for row in ended.metrics]
+    assert before == [None] * len(before)
+    assert last.as_dict() == ended.summary["stopping"]
 
 
 def test_a_budgets_alerts_go_to_the_log_and_the_command(trained, tmp_path):

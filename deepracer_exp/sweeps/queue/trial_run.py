@@ -51,7 +51,7 @@ from .worker_config import RUN_ID, WorkerConfig, plan_trial
 Value = TypeVar("Value")
 
 _KEEPS = {"report": "false", "trace": "laps"}
-"""What a trial's run keeps, unless its overrides say otherwise: traces of all steps were two thirds of a study's disk."""
+"""What a trial's run keeps unless its overrides say more: all steps were two thirds of a study's disk."""
 _MOST_TRIES = 3
 """How often a run is started or resumed at the same checkpoint if its process is lost each time."""
 _STATES = {FAILED: "FAIL", STOPPED_EARLY: "PRUNED"}
