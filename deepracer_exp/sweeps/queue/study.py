@@ -19,6 +19,7 @@ from deepracer_exp.sweeps.search.objectives import MEASURES
 
 from .claims import TABLE
 from .storage import open_storage, resolve_database
+from .widening import complete_widening, widen
 
 if TYPE_CHECKING:  # to find a study needs nothing of what composes one
     from deepracer_exp.config.compose import Composition
@@ -51,30 +52,6 @@ def find_study(name: str, storage: RDBStorage) -> Study | None:
     if "space" in study.user_attrs and study.user_attrs.get("claims") != TABLE:
         raise BadInput(f"study {name}: an earlier version began it, and alone can read it; give another name")
     return study
-
-
-COMPLETE = "is_complete"
-"""Attribute of a wider study under its first name: it has all trials, and replaces the other one."""
-
-
-def aside(name: str) -> str:
-    """Return the name under which a wider study is made."""
-    return f"{name} (wider)"
-
-
-def complete_widening(name: str, storage: RDBStorage) -> None:
-    """Replace a study by the wider one beside it, if there is one with all trials; no other process does so now."""
-    try:
-        wider = optuna.load_study(study_name=aside(name), storage=storage)
-    except KeyError:
-        return
-    if COMPLETE in wider.user_attrs:
-        if name in optuna.get_all_study_names(storage):
-            optuna.delete_study(study_name=name, storage=storage)
-        optuna.copy_study(
-            from_study_name=aside(name), from_storage=storage, to_storage=storage, to_study_name=name
-        )
-        optuna.delete_study(study_name=aside(name), storage=storage)
 
 
 def load_study(name: str, storage: RDBStorage) -> Study:
@@ -141,7 +118,6 @@ def open_study(
     """
     from deepracer_exp.config.overrides import key_of
 
-    from .widening import widen
     from .worker_config import plan_trial
 
     name, sweep = request.study, request.entry.sweep

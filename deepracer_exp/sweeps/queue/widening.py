@@ -6,29 +6,51 @@ under its own. The next start of the sweep completes what a killed process has l
 
 import copy
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import optuna
 from optuna.storages import RDBStorage
 from optuna.study import Study
 from optuna.trial import FrozenTrial, TrialState
 
-from deepracer_exp.config.compose import Composition
-from deepracer_exp.config.options import groups
 from deepracer_exp.errors import BadInput
-from deepracer_exp.sweeps.search.space import Dimension, SearchSpace, value_at
 
 from .claims import TrialClaims, report_results
-from .study import COMPLETE, aside, complete_widening
-from .worker_config import is_gone
+
+if TYPE_CHECKING:  # to find a study needs nothing of what composes one
+    from deepracer_exp.config.compose import Composition
+    from deepracer_exp.sweeps.search.space import Dimension, SearchSpace
+
+COMPLETE = "is_complete"
+"""Attribute of a wider study under its first name: it has all trials, and replaces the other one."""
+
+
+def aside(name: str) -> str:
+    """Return the name under which a wider study is made."""
+    return f"{name} (wider)"
+
+
+def complete_widening(name: str, storage: RDBStorage) -> None:
+    """Replace a study by the wider one beside it, if there is one with all trials; no other process does so now."""
+    try:
+        wider = optuna.load_study(study_name=aside(name), storage=storage)
+    except KeyError:
+        return
+    if COMPLETE in wider.user_attrs:
+        if name in optuna.get_all_study_names(storage):
+            optuna.delete_study(study_name=name, storage=storage)
+        optuna.copy_study(
+            from_study_name=aside(name), from_storage=storage, to_storage=storage, to_study_name=name
+        )
+        optuna.delete_study(study_name=aside(name), storage=storage)
 
 
 def widen(
     study: Study,
     storage: RDBStorage,
-    space: SearchSpace,
+    space: "SearchSpace",
     attributes: Mapping[str, Any],
-    composed: Callable[[list[str]], Composition],
+    composed: "Callable[[list[str]], Composition]",
 ) -> Study:
     """Return the study with a wider space and these attributes, and with all its trials under their numbers.
 
@@ -45,6 +67,8 @@ def widen(
     Raises:
         BadInput: a trial is running.
     """
+    from .worker_config import is_gone
+
     name = study.study_name
     claims = TrialClaims(storage.engine, name)
     running = [
@@ -72,7 +96,7 @@ def widen(
 
 
 def _in_space(
-    trial: FrozenTrial, space: SearchSpace, composed: Callable[[list[str]], Composition]
+    trial: FrozenTrial, space: "SearchSpace", composed: "Callable[[list[str]], Composition]"
 ) -> FrozenTrial:
     """Return a trial as one of the wider space; what samplers have noted of it is left out."""
     moved = copy.deepcopy(trial)
@@ -92,17 +116,20 @@ def _in_space(
     return moved
 
 
-def _as_in(axis: Dimension, value: Any) -> Any:
+def _as_in(axis: "Dimension", value: Any) -> Any:
     """Return a value of a narrower dimension; a whole number may have become one of any numbers."""
     return float(value) if isinstance(axis.distribution, optuna.distributions.FloatDistribution) else value
 
 
-def _counts(axis: Dimension, params: Mapping[str, Any]) -> bool:
+def _counts(axis: "Dimension", params: Mapping[str, Any]) -> bool:
     return axis.options is None or params.get(str(axis.group)) in axis.options
 
 
-def _trained_with(axis: Dimension, composition: Composition) -> list[Any]:
+def _trained_with(axis: "Dimension", composition: "Composition") -> list[Any]:
     """Return the value that a trial was trained with; an empty list if it is not searched."""
+    from deepracer_exp.config.options import groups
+    from deepracer_exp.sweeps.search.space import value_at
+
     if axis.key in groups():
         plain = [composition.choices[axis.key]] if axis.key in composition.choices else []
     else:
