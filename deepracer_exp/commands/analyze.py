@@ -112,8 +112,9 @@ def _analyze(args: argparse.Namespace) -> int:
     log = read_log(place)
     if _wants_laps_only(args):
         view = prepare(log, args.track)
+        written = _write_laps_asked_for(args, view, episode)
         print(f"{view.name}: {headline(view)}\n")
-        _write_laps_asked_for(args, view, episode)
+        print(*written, sep="\n")
         return 0
     try:
         config = read_config(place) if is_traced_run(place) else {}
@@ -150,7 +151,8 @@ def _analyze(args: argparse.Namespace) -> int:
     if view.problems:
         print(f"\n  {count(len(view.problems), 'problem')} while reading, the first: {view.problems[0]}")
     end_with_page(out, args.open)
-    _write_laps_asked_for(args, view, episode)
+    for line in _write_laps_asked_for(args, view, episode):
+        print(line)
     return 0
 
 
@@ -160,8 +162,8 @@ def _wants_laps_only(args: argparse.Namespace) -> bool:
     return not (shown or args.reward or args.target) and (args.replay is not None or args.line is not None)
 
 
-def _write_laps_asked_for(args: argparse.Namespace, view: "LogView", episode: int | None) -> None:
-    """Write the page of two laps and the line of one, where they are asked for, and print where they are.
+def _write_laps_asked_for(args: argparse.Namespace, view: "LogView", episode: int | None) -> list[str]:
+    """Write the page of two laps and the line of one, where they are asked for; return where they are.
 
     Raises:
         BadInput: the log has no such lap, or a file cannot be written.
@@ -170,13 +172,15 @@ def _write_laps_asked_for(args: argparse.Namespace, view: "LogView", episode: in
     from deepracer_exp.reports.lap_replay import laps_of_log
 
     line = None if args.line is None else recorded_line(view, episode)
+    written = []
     if args.replay is not None:
         write_laps(args.replay, laps_of_log(view, None))
-        print(f"  laps  {args.replay}")
+        written.append(f"  laps  {args.replay}")
     if line is not None:
         with writing(f"--line {args.line}"):
             write_line(Path(args.line), line[0])
-        print(f"  line  {args.line} ({line[1]})")
+        written.append(f"  line  {args.line} ({line[1]})")
+    return written
 
 
 def _car(config: dict[str, Any]) -> "CarConfig":

@@ -17,7 +17,7 @@ class Terminal(Console):
     def __init__(self, *, stderr: bool = False, **options: Any) -> None:
         """Write to standard output or error; `options` are those of Rich's console."""
         stream = sys.stderr if stderr else sys.stdout
-        super().__init__(file=getattr(stream, "as_is", stream), stderr=stderr, **options)
+        super().__init__(stderr=stderr, **{"file": getattr(stream, "as_is", stream), **options})
 
     @override
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:

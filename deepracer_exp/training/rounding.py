@@ -25,9 +25,7 @@ def rounded(experiment: Experiment) -> list[str]:
     if not isinstance(algorithm, PPOConfig) or algorithm.target is not None:
         return lines
     size = algorithm.batch_size
-    if size > frames:
-        lines.append(f"algorithm.batch_size={size}: a minibatch has {frames:,} steps, all of an iteration")
-    elif left_out := frames % size:
+    if left_out := frames % size:
         lines.append(
             f"algorithm.batch_size={size}: each pass leaves out {left_out:,} of an iteration's {frames:,} steps, "
             "others each time"

@@ -30,20 +30,26 @@ def stored(state, folder):
     return holder.values
 
 
-def assert_same(batches, expected) -> None:
+def assert_same(batches, expected, tolerance=0.0) -> None:
     for batch, wanted in zip(batches, expected, strict=True):
         assert set(batch.keys(True, True)) == set(wanted.keys(True, True))
         for key, values in wanted.items(True, True):
             # NaN stands for a missing value in columns of the trace.
-            assert torch.equal(batch[key].nan_to_num(7.0), values.nan_to_num(7.0)), key
+            torch.testing.assert_close(
+                batch[key], values, rtol=tolerance, atol=tolerance, equal_nan=True, msg=str(key)
+            )
 
 
 @pytest.mark.parametrize(
-    "overrides",
-    [("action_space=continuous", "observation=lidar"), EVERYTHING],
+    ("overrides", "tolerance"),
+    [
+        # The policy of a LIDAR is Torch's, whose product of 4 rows may be rounded otherwise than that of 16.
+        (("action_space=continuous", "observation=lidar"), 1e-3),
+        (EVERYTHING, 0.0),
+    ],
     ids=["continuous", "everything"],
 )
-def test_batches_do_not_depend_on_how_the_cars_are_spread_over_processes(driver_of, overrides):
+def test_batches_do_not_depend_on_how_the_cars_are_spread_over_processes(driver_of, overrides, tolerance):
     def batches(*where):
         driver = driver_of("collector.cars=16", *where, *overrides, frames=16 * 40)
         collection = driver.open()
@@ -55,7 +61,7 @@ def test_batches_do_not_depend_on_how_the_cars_are_spread_over_processes(driver_
     alone = batches("collector.mode=in_process")
     assert alone[0].batch_size == (16, 40)
     for processes in (2, 4):
-        assert_same(batches("collector.mode=sync", f"collector.processes={processes}"), alone)
+        assert_same(batches("collector.mode=sync", f"collector.processes={processes}"), alone, tolerance)
 
 
 @pytest.mark.parametrize("collector", [IN_PROCESS, SYNC], ids=["in_process", "sync"])

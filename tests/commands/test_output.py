@@ -131,10 +131,13 @@ def test_no_other_console_prints():
     made = {
         (
             str(file.relative_to(package)),
-            tuple(keyword.arg for keyword in call.keywords if keyword.arg == "quiet"),
+            call.func.id,
         )
         for file in package.rglob("*.py")
         for call in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
-        if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Console"
+        if isinstance(call, ast.Call)
+        and isinstance(call.func, ast.Name)
+        and call.func.id in {"Console", "Terminal"}
+        and not any(keyword.arg == "quiet" for keyword in call.keywords)
     }
-    assert {file for file, quiet in made if not quiet} == {"commands/output.py"}
+    assert made == {("commands/output.py", "Terminal")}

@@ -48,7 +48,9 @@ def test_runs_are_listed_newest_first_with_state_and_results(call, tmp_path):
         fcntl.flock(lock, fcntl.LOCK_EX)
         ended = call("runs")
     assert ended.code == 0, ended.stderr
-    rows = [line.split() for line in ended.stdout.splitlines()[1:]]
+    _, *listed, note = ended.stdout.splitlines()
+    assert note.startswith("lap, race score: of the best checkpoint")
+    rows = [line.split() for line in listed]
     assert rows == [
         [f"a/{names[2]}", "running", NONE, NONE, NONE, NONE, "1", "min"],
         [f"b/{names[1]}", "failed", NONE, NONE, "0", NONE, "2", "h"],

@@ -23,7 +23,7 @@ def test_the_page_is_complete_and_loads_nothing(study, tmp_path):
     assert "link" not in page.tags[page.tags.index("body") :]
     assert path.stat().st_size < 2_500_000
     assert html.count('id="plotly"') == 1
-    for name in ("history", "importance", "slice", "parallel", "entropy"):
+    for name in ("history", "importance", "slice", "parallel"):
         assert f'data-plot="{name}"' in html
     assert f"Trial {study.best_trial.number} is the best" in page.text
     assert "deepracer-exp train algorithm.lr=" in page.text
@@ -45,7 +45,7 @@ def test_a_browser_draws_all_of_it_asks_for_nothing_and_offers_no_upload(study, 
     path = write_study_page(study, tmp_path / "report.html")
     tab.open(path)
     tab.draw_all()
-    assert tab.evaluate("document.querySelectorAll('[data-state=drawn]').length") == 5
+    assert tab.evaluate("document.querySelectorAll('[data-state=drawn]').length") == 4
     assert not tab.evaluate("document.body.innerText.includes('WebGL')")
     assert not tab.evaluate(
         "[...document.querySelectorAll('.modebar-btn')].some(b => /share/i.test(b.dataset.title))"

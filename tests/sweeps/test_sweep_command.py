@@ -17,7 +17,7 @@ from tests.training.conftest import assert_same_run, workers_start_early  # noqa
 TINY = (
     *("sweep", "experiment=tiny", "tracking=off", "collector.threads=1", "checkpoints.every=1"),
     *("episode.max_steps=60", "budget.env_steps=null", "budget.iterations=4", "sweep.protocol=three_trials"),
-    *("sweep.workers=1", "sweep.rerank_laps=2"),
+    *("sweep.workers=1", "sweep.rerank_laps=2", "trace=full"),
     "algorithm.frames_per_iteration=256",
 )
 LR = "algorithm.lr=tag(log,interval(1e-5,1e-3))"
@@ -101,8 +101,8 @@ def test_a_finished_study_makes_no_trial_again(swept, run_at):
 
 
 def test_another_search_under_the_same_name_is_refused_with_the_difference(swept, call_at):
-    ended = call_at(swept.cwd, *TINY, "study=s", LR.replace("1e-3", "1e-2"), "sweep.trials=2")
-    ended.assert_refused("study=s: exists", "algorithm.lr", "1e-3", "1e-2")
+    ended = call_at(swept.cwd, *TINY, "study=s", LR.replace("1e-5", "1e-4"), "sweep.trials=2")
+    ended.assert_refused("study=s: exists", "algorithm.lr", "1e-5", "1e-4")
 
 
 def test_a_resumed_study_knows_its_search_and_names_the_keys_that_may_be_given(swept, call_at):

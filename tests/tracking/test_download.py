@@ -3,6 +3,7 @@
 import contextlib
 import io
 import json
+import os
 import resource
 import shutil
 import sys
@@ -48,7 +49,7 @@ def downloads_here(monkeypatch):
                 process.returncode = module._main()
             return None, said.getvalue().encode()
 
-        process = SimpleNamespace(communicate=communicate)
+        process = SimpleNamespace(communicate=communicate, pid=os.getpid())
         yield process
 
     monkeypatch.setattr(module, "running", running)

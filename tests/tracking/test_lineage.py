@@ -33,7 +33,7 @@ def test_any_member_shows_the_whole_family_and_no_other(clan):
         assert list(found) == ["1-root", "2-child", "4-grandchild", "3-sibling"]
         assert [member.generation for member in found.values()] == [0, 1, 2, 1]
         assert found["4-grandchild"].changes == {"algorithm.lr": (0.0001, 1e-5)}
-        assert best_members(root) == {id(found["2-child"]): "best by mean lap (usual and held-out)"}
+        assert best_members(root) == {id(found["2-child"]): "best by mean lap (usual)"}
     (alone,) = family(clan.runs_dir / "season" / "9-stranger", clan.runs_dir).walk()
     assert alone.name == "9-stranger"
 
@@ -57,7 +57,7 @@ def test_the_tree_in_a_terminal_is_styled(clan, call, monkeypatch):
 def test_the_tree_in_a_pipe_says_what_a_terminal_shows_by_colour(clan, call):
     ended = call("runs", "lineage", "4-grandchild")
     assert rows(ended.stdout, "4-grandchild", "<- this run")
-    assert rows(ended.stdout, "2-child", "* best by mean lap (usual and held-out)")
+    assert rows(ended.stdout, "2-child", "* best by mean lap (usual)")
     assert len(rows(ended.stdout, "<- this run")) == len(rows(ended.stdout, "* best")) == 1
     assert rows(ended.stdout, "generation 2, from 000030, mean usual lap 10.00 s, usual completion 90.0%")
     assert rows(ended.stdout, "algorithm.lr 0.0001 -> 1e-05")
@@ -102,8 +102,8 @@ def test_a_clone_on_another_track_has_a_best_of_its_own(clan, call):
     there = clan.clone("5-away", parent, 2, track={"name": "bowtie", "knots": [1]})
     clan.result(there, (1, -20.0), 20.0)
     ended = call("runs", "lineage", "1-root")
-    assert rows(ended.stdout, "5-away", "* best on bowtie by mean lap (usual and held-out)")
-    assert rows(ended.stdout, "2-child", "* best on oval by mean lap (usual and held-out)")
+    assert rows(ended.stdout, "5-away", "* best on bowtie by mean lap (usual)")
+    assert rows(ended.stdout, "2-child", "* best on oval by mean lap (usual)")
     assert rows(ended.stdout, "track oval -> bowtie")
     assert rows(ended.stdout, "generation 2", "bowtie", "20.00 s")
     assert rows(ended.stdout, "generation 2", "oval", "10.00 s")

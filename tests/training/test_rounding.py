@@ -24,10 +24,6 @@ CARS = ("experiment=tiny", "collector.cars=16")
                 "algorithm.batch_size=300: each pass leaves out 108 of an iteration's 1,008 steps, others each time",
             ],
         ),
-        (
-            ("algorithm.frames_per_iteration=1008", "algorithm.batch_size=9000"),
-            ["algorithm.batch_size=9000: a minibatch has 1,008 steps, all of an iteration"],
-        ),
         (("algorithm.frames_per_iteration=null", "algorithm.episodes_per_iteration=20"), []),
     ],
 )

@@ -1,6 +1,7 @@
 """Figures of a study, which Optuna draws, in the style of all pages."""
 
 import json
+import textwrap
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from itertools import combinations
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
-from deepracer_exp.analysis.charts.style import GRID, NARROW_WIDTH, Figure, base_layout
+from deepracer_exp.analysis.charts.style import FAINT, GRID, NARROW_WIDTH, SPINE, Figure, base_layout
 from deepracer_exp.sweeps.search.objectives import MEASURES, objectives_of
 
 if TYPE_CHECKING:
@@ -22,6 +23,8 @@ _BEST_SHARE = 0.25
 _HEIGHT = 440
 _PANEL_PX = 200
 """Least width of a panel, or of the room for an axis of parallel coordinates."""
+_BAR_LETTERS = 16
+"""Most letters in a line of the title of a colour bar."""
 _FAR, _NEAR = 5.0, 0.25
 """A trial is off the axis if it is farther from the best than this many times the median is, and worse than the best
 by more than this share of it."""
@@ -105,7 +108,12 @@ def _drawn(study: optuna.Study) -> "Iterator[tuple[str, str, go.Figure]]":
         yield (
             f"pareto-{'-'.join(objectives[index] for index in pair)}",
             "Pareto front: no other trial is better in every objective",
-            front.update_xaxes(range=ranges[pair[0]]).update_yaxes(range=ranges[pair[1]]),
+            # Of a thousand trials with all that is noted of them, the words would be three megabytes.
+            front.update_traces(
+                text=None, hovertemplate="trial %{marker.color}: %{x:.4g}, %{y:.4g}<extra></extra>"
+            )
+            .update_xaxes(range=ranges[pair[0]])
+            .update_yaxes(range=ranges[pair[1]]),
         )
 
 
@@ -122,10 +130,19 @@ def _styled(figure: "go.Figure", title: str) -> Figure:
     for update in (figure.update_xaxes, figure.update_yaxes):
         update(gridcolor=GRID, zeroline=False, automargin=True)
     drawn: Figure = json.loads(figure.to_json())
-    axes = [trace["dimensions"] for trace in drawn["data"] if "dimensions" in trace]
-    panels = len(axes[0]) if axes else sum(name.startswith("xaxis") for name in drawn["layout"])
+    for trace in drawn["data"]:
+        bar = trace.get("marker", {}).get("colorbar")
+        if bar is not None:  # a title in one line leaves no room for the plot on a phone
+            bar["title"] = {"text": "<br>".join(textwrap.wrap(bar["title"]["text"], _BAR_LETTERS))}
+    layout = drawn["layout"]
+    for note in layout.get("annotations", ()):
+        note["font"] = {"size": 11, "color": FAINT}
+    for line in layout.get("shapes", ()):
+        line["line"]["color"] = SPINE
+    # Parallel coordinates have one axis, with a tick for each parameter.
+    panels = len(layout["xaxis"].get("tickvals", ())) or sum(name.startswith("xaxis") for name in layout)
     least_px = _PANEL_PX * panels if panels > 1 else 0
-    drawn["layout"] |= base_layout(title) | {"meta": {"title": title, "least_width": least_px}}
+    layout |= base_layout(title) | {"meta": {"title": title, "least_width": least_px}}
     return drawn
 
 
