@@ -23,8 +23,8 @@ _BEST_SHARE = 0.25
 _HEIGHT = 440
 _PANEL_PX = 200
 """Least width of a panel, or of the room for an axis of parallel coordinates."""
-_BAR_LETTERS = 16
-"""Most letters in a line of the title of a colour bar."""
+_LETTERS = 20
+"""Most letters in a line of the name of a colour bar or an axis."""
 _FAR, _NEAR = 5.0, 0.25
 """A trial is off the axis if it is farther from the best than this many times the median is, and worse than the best
 by more than this share of it."""
@@ -78,7 +78,11 @@ def _drawn(study: optuna.Study) -> "Iterator[tuple[str, str, go.Figure]]":
         words, suffix = MEASURES[objective].label, "" if is_one else f"-{objective}"
         target = None if is_one else _value(index, 1.0)
         history = visualization.plot_optimization_history(study, target=target, target_name=words)
-        yield f"history{suffix}", f"Complete trials: {words}", history.update_yaxes(range=ranges[index])
+        yield (
+            f"history{suffix}",
+            f"Complete trials: {words}",
+            history.update_yaxes(range=ranges[index], title=None),
+        )
         if len(complete) >= FEWEST_COMPLETE and len(parameters) > 1:
             evaluator = optuna.importance.PedAnovaImportanceEvaluator(target_quantile=_BEST_SHARE)
             cost = None if is_one else _value(index, 1.0 if MEASURES[objective].minimize else -1.0)
@@ -87,11 +91,15 @@ def _drawn(study: optuna.Study) -> "Iterator[tuple[str, str, go.Figure]]":
                 f"Which parameters mattered most: {words}",
                 visualization.plot_param_importances(
                     study, evaluator=evaluator, target=cost, target_name=words
-                ),
+                ).update_yaxes(title=None),
             )
         if parameters:
             slices = visualization.plot_slice(study, target=target, target_name=words)
-            yield f"slice{suffix}", f"Each parameter: {words}", slices.update_yaxes(range=ranges[index])
+            yield (
+                f"slice{suffix}",
+                f"Each parameter: {words}",
+                slices.update_yaxes(range=ranges[index], title=None),
+            )
         if len(parameters) > 1 and len(complete) > 1:
             yield (
                 f"parallel{suffix}",
@@ -133,17 +141,24 @@ def _styled(figure: "go.Figure", title: str) -> Figure:
     for trace in drawn["data"]:
         bar = trace.get("marker", {}).get("colorbar")
         if bar is not None:  # a title in one line leaves no room for the plot on a phone
-            bar["title"] = {"text": "<br>".join(textwrap.wrap(bar["title"]["text"], _BAR_LETTERS))}
+            bar["title"] = {"text": _in_lines(bar["title"]["text"])}
     layout = drawn["layout"]
     for note in layout.get("annotations", ()):
         note["font"] = {"size": 11, "color": FAINT}
     for line in layout.get("shapes", ()):
         line["line"]["color"] = SPINE
     # Parallel coordinates have one axis, with a tick for each parameter.
-    panels = len(layout["xaxis"].get("tickvals", ())) or sum(name.startswith("xaxis") for name in layout)
+    names = [_in_lines(name) for name in layout["xaxis"].get("ticktext", ())]
+    if names:
+        layout["xaxis"] |= {"ticktext": names, "tickangle": 0}
+    panels = len(names) or sum(name.startswith("xaxis") for name in layout)
     least_px = _PANEL_PX * panels if panels > 1 else 0
     layout |= base_layout(title) | {"meta": {"title": title, "least_width": least_px}}
     return drawn
+
+
+def _in_lines(name: str) -> str:
+    return "<br>".join(textwrap.wrap(name, _LETTERS))
 
 
 def narrowed(figure: Figure) -> Figure:
