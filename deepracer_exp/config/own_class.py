@@ -25,9 +25,9 @@ GROUPS = ("network", "algorithm", "lr_schedule", "observation", "stopping", "tra
 """Groups whose option may be a class of your own. Entry points are registered under `deepracer_exp.GROUP`."""
 OF_POLICY = ("network", "observation")
 """Those that a stored policy needs, in an evaluation or an export."""
-_REFERENCE = r"[A-Za-z_][\w.]*:[A-Za-z_]\w*"
-Reference = Annotated[str, Field(pattern=rf"^{_REFERENCE}$")]
-_GIVEN = re.compile(rf"(?:{'|'.join(GROUPS)})\.target=({_REFERENCE})")
+REFERENCE = r"[A-Za-z_][\w.]*:[A-Za-z_]\w*"
+Reference = Annotated[str, Field(pattern=rf"^{REFERENCE}$")]
+_GIVEN = re.compile(rf"(?:{'|'.join(GROUPS)})\.target=({REFERENCE})")
 
 Base = TypeVar("Base")
 
@@ -55,7 +55,7 @@ def own_option(group: str, name: str) -> dict[str, Any] | None:
     """Return the values of the option `GROUP=package.module:Class` or of an entry point; None if it is neither."""
     if group not in GROUPS:
         return None
-    target = name if re.fullmatch(_REFERENCE, name) else registered(group).get(name)
+    target = name if re.fullmatch(REFERENCE, name) else registered(group).get(name)
     if target is None:
         return None
     option = {"target": target, "kwargs": {}}
@@ -154,9 +154,9 @@ def _is_registered(target: str) -> bool:
 
 def _references(values: Any) -> Iterator[str]:
     if isinstance(values, dict):
-        target = values.get("target")
-        if isinstance(target, str) and re.fullmatch(_REFERENCE, target):
-            yield target
+        for target in (values.get("target"), values.get("sampler")):
+            if isinstance(target, str) and re.fullmatch(REFERENCE, target):
+                yield target
         values = list(values.values())
     if isinstance(values, list):
         for value in values:

@@ -1,12 +1,13 @@
 """A sweep: a search over experiments (`conf/sweep/`), and its entry point."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from deepracer_exp.errors import BadInput
 
@@ -24,11 +25,12 @@ from .evaluation import EvaluationConfig
 from .experiment import SafeName
 from .options import groups
 from .overrides import PLAIN_TEXT, key_of, parse_sweep
+from .own_class import REFERENCE
 from .parse import parse_config
 
 Objective = Literal["race_score", "lap_time", "completion", "zigzag"]
 Pruner = Literal["entropy", "median", "percentile", "hyperband", "wilcoxon"]
-Sampler = Literal["tpe", "gp", "cmaes", "qmc", "random", "grid", "nsga2"]
+SAMPLERS = ("tpe", "gp", "cmaes", "random", "grid")
 
 _ENTRY = "sweep"
 _OF_THE_SWEEP = ("study", "parent", "debug", "sweep", "sweep/executor")
@@ -37,6 +39,12 @@ _NOT_SEARCHED = {
     "runs_dir": "all runs of a study share one folder",
     "tracking": "all runs of a study are recorded in the same store",
 }
+
+
+def _sampler(name: str) -> str:
+    if name in SAMPLERS or re.fullmatch(REFERENCE, name):
+        return name
+    raise ValueError(f"accepted: {', '.join(SAMPLERS)}, or package.module:Class, one of Optuna's or your own")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +78,7 @@ class SweepConfig:
     objectives: Annotated[tuple[Objective, ...], Field(min_length=1)]
     rerank: Annotated[int, Field(ge=0, le=1000)]
     rerank_laps: Annotated[int, Field(ge=1, le=4096)]
-    sampler: Sampler
+    sampler: Annotated[str, AfterValidator(_sampler)]
     seed: Annotated[int, Field(ge=0, lt=2**31)]
     startup_trials: Natural
     pruners: tuple[Pruner, ...]

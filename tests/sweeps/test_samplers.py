@@ -1,4 +1,3 @@
-from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,13 +6,14 @@ import pytest
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 from optuna.trial import TrialState, create_trial
 
+from deepracer_exp.config.own_class import allow
 from deepracer_exp.config.sweep import SweepConfig
 from deepracer_exp.errors import BadInput
 from deepracer_exp.sweeps.search.samplers import build_sampler
 
 from . import studies
 
-NAMES = ("tpe", "gp", "cmaes", "qmc", "random", "nsga2")
+NAMES = ("tpe", "gp", "cmaes", "random")
 """Every sampler that searches ranges; grid has a space of its own."""
 
 
@@ -105,7 +105,7 @@ def test_workers_that_begin_together_try_different_values_and_the_same_at_each_s
     assert begun() == found
 
 
-@pytest.mark.parametrize("name", ["tpe", "random", "qmc"])
+@pytest.mark.parametrize("name", ["tpe", "random"])
 def test_a_trial_draws_by_its_number_whatever_became_of_those_before(name):
     def drawn(earlier: TrialState) -> dict:
         study = optuna.create_study(sampler=build_sampler(settings(name), Space()))
@@ -117,11 +117,33 @@ def test_a_trial_draws_by_its_number_whatever_became_of_those_before(name):
     assert drawn(TrialState.FAIL) == drawn(TrialState.RUNNING)
 
 
-def test_qmc_covers_every_key_evenly_however_many_workers_ask():
-    found = searched("qmc", trials=16)
-    decades = Counter(int((np.log10(values["algorithm.lr"]) + 5) * 4) for values in found)
-    assert set(decades.values()) == {2}  # 16 points of a Sobol sequence, eight equal parts
-    assert Counter(values["network"] for values in found) == {"mlp": 8, "mlp_shared": 8}
+def test_a_class_by_its_path_searches_with_a_seed_for_each_trial():
+    allow({"sampler": "optuna.samplers:NSGAIISampler"})
+    found = searched("optuna.samplers:NSGAIISampler", trials=7)
+    assert len({values["algorithm.lr"] for values in found}) == 7
+    assert searched("optuna.samplers:NSGAIISampler", trials=7) == found
+
+
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [
+        ("optuna.samplers:Nothing", "package.module:Class, installed or in the working folder"),
+        ("os:path", "is a module; accepted: a class"),
+        ("json:JSONDecoder", "accepted: a subclass of optuna.samplers"),
+        ("optuna.samplers:GridSampler", "missing a required argument: 'search_space'"),
+    ],
+)
+def test_a_path_of_something_else_is_refused(path, words):
+    allow({"sampler": path})
+    with pytest.raises(BadInput) as refused:
+        build_sampler(settings(path), Space())
+    assert str(refused.value).startswith(f"sweep.sampler={path}")
+    assert words in str(refused.value)
+
+
+def test_a_class_that_only_a_study_names_is_not_imported():
+    with pytest.raises(BadInput, match=r"^sweep\.sampler=nobodys\.module:Sampler: named by a stored"):
+        build_sampler(settings("nobodys.module:Sampler"), Space())
 
 
 @pytest.mark.filterwarnings("error")

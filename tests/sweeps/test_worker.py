@@ -62,7 +62,7 @@ def made(tmp_path, monkeypatch, *asked: str) -> list[FrozenTrial]:
     return optuna.load_study(study_name="s", storage=storage).trials
 
 
-@pytest.mark.parametrize("sampler", ["tpe", "gp", "cmaes", "qmc", "random", "grid", "nsga2"])
+@pytest.mark.parametrize("sampler", ["tpe", "gp", "cmaes", "random", "grid", "optuna.samplers:NSGAIISampler"])
 def test_with_every_sampler_all_trials_draw_their_values_and_are_reported(sampler, tmp_path, monkeypatch):
     searched = SPACE.get(sampler, MIXED)
     trials = made(tmp_path, monkeypatch, *searched, f"sweep.sampler={sampler}", "sweep.trials=5")

@@ -14,16 +14,14 @@ from optuna.samplers import (
     CmaEsSampler,
     GPSampler,
     GridSampler,
-    NSGAIISampler,
-    QMCSampler,
     RandomSampler,
     TPESampler,
 )
-from optuna.samplers.nsgaii import BLXAlphaCrossover
 from optuna.study import Study
 from optuna.trial import FrozenTrial, TrialState
 
-from deepracer_exp.config.sweep import SweepConfig
+from deepracer_exp.config.own_class import OwnClass, build_own
+from deepracer_exp.config.sweep import SAMPLERS, SweepConfig
 from deepracer_exp.errors import BadInput
 
 from .space import SearchSpace
@@ -33,7 +31,8 @@ def build_sampler(config: SweepConfig, space: SearchSpace) -> BaseSampler:
     """Build the sampler of a study; every worker builds its own.
 
     Raises:
-        BadInput: the sampler cannot search this space, or not for these objectives.
+        BadInput: the sampler cannot search this space, or not for these objectives; or it is a class that cannot be
+            built.
     """
     if config.sampler == "cmaes":
         _check_cmaes(config, space)
@@ -43,10 +42,15 @@ def build_sampler(config: SweepConfig, space: SearchSpace) -> BaseSampler:
     def make(number: int) -> BaseSampler:
         seed = int(np.random.SeedSequence([config.seed, number]).generate_state(1)[0])
         with warnings.catch_warnings():
-            # Experimental in Optuna, whose version is pinned: group, with_margin, QMCSampler, BLXAlphaCrossover.
+            # Experimental in Optuna, whose version is pinned: group, with_margin, and some of its other samplers.
             warnings.simplefilter("ignore", ExperimentalWarning)
-            return _SAMPLERS[config.sampler](config, space, number, seed)
+            if config.sampler in SAMPLERS:
+                return _SAMPLERS[config.sampler](config, space, number, seed)
+            chosen = OwnClass(target=config.sampler, kwargs={"seed": seed})
+            return build_own(chosen, "sweep.sampler", BaseSampler)
 
+    if config.sampler not in SAMPLERS:
+        make(0)
     return _PerTrialSampler(make)
 
 
@@ -89,24 +93,6 @@ class _PerTrialSampler(BaseSampler):
         if trial.number not in self._open:
             self._open[trial.number] = self._make(trial.number)
         return self._open[trial.number]
-
-
-class _WholeSpaceQMC(QMCSampler):
-    """Point n of one sequence over the whole space for the trial with number n, whichever worker asks.
-
-    Optuna's own counts the points in the study, where two workers may read the same count, and takes the space from
-    the first trial, so that keys of other options would be drawn at random.
-    """
-
-    def __init__(self, space: dict[str, BaseDistribution], number: int, seed: int):
-        super().__init__(scramble=True, seed=seed)
-        self._space, self._number = space, number
-
-    def infer_relative_search_space(self, study: Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
-        return self._space
-
-    def _find_sample_id(self, study: Study, search_space: dict[str, BaseDistribution]) -> int:
-        return self._number
 
 
 class _EndlessGrid(GridSampler):
@@ -166,15 +152,6 @@ _SAMPLERS: dict[str, Callable[[SweepConfig, SearchSpace, int, int], BaseSampler]
     "cmaes": lambda config, space, number, seed: CmaEsSampler(
         n_startup_trials=config.startup_trials, seed=seed, with_margin=True, warn_independent_sampling=False
     ),
-    "qmc": lambda config, space, number, seed: _WholeSpaceQMC(_distributions(space), number, config.seed),
-    # The first generation, drawn at random, is the startup of the others. Children are blends of both parents: a copy
-    # of one would be the same training again.
-    "nsga2": lambda config, space, number, seed: NSGAIISampler(
-        population_size=max(config.startup_trials, 2),
-        seed=seed,
-        crossover=BLXAlphaCrossover(),
-        crossover_prob=1.0,
-    ),
     # The sweep's seed gives the order of all points.
     "grid": lambda config, space, number, seed: _EndlessGrid(dict(space.grid()), seed=config.seed),
     "random": lambda config, space, number, seed: RandomSampler(seed=seed),
@@ -187,7 +164,7 @@ def _distributions(space: SearchSpace) -> dict[str, BaseDistribution]:
 
 
 def _check_cmaes(config: SweepConfig, space: SearchSpace) -> None:
-    others = ", ".join(name for name in _SAMPLERS if name != "cmaes")
+    others = ", ".join(name for name in SAMPLERS if name != "cmaes")
     if len(config.objectives) > 1:
         raise BadInput(
             f"sweep.sampler=cmaes: follows one objective, and sweep.objectives has {len(config.objectives)}; "
