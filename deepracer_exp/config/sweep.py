@@ -29,7 +29,7 @@ from .own_class import REFERENCE
 from .parse import parse_config
 
 Objective = Literal["race_score", "lap_time", "completion", "zigzag"]
-Pruner = Literal["entropy", "median", "percentile", "hyperband", "wilcoxon"]
+Pruner = Literal["entropy", "median", "percentile", "hyperband"]
 SAMPLERS = ("tpe", "gp", "cmaes", "random", "grid")
 
 _ENTRY = "sweep"

@@ -185,7 +185,7 @@ def test_an_options_pattern_stands_for_the_options_of_today():
         ("sweep=lr_entropi", ["no such sweep (did you mean lr_entropy?)"]),
         ("sweep/executor=loca", ["no such sweep/executor (did you mean local?)"]),
         ("sweep.protocol=three_trial", ["no such evaluation (did you mean three_trials?)"]),
-        ("sweep.sampler=tpe2", ["sweep.sampler", "'tpe'"]),
+        ("sweep.sampler=tpe2", ["sweep.sampler", "accepted: tpe, gp, cmaes"]),
         ("sweep.sampler=tpe,gp", ["accepted: one value"]),
         ("sweep.pruners=entropy,median", ["sweep.pruners=[entropy,median]"]),
         ("sweep.pruners=[entropy,entropy]", ["listed twice"]),

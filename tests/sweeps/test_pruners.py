@@ -8,8 +8,7 @@ from optuna.trial import TrialState, create_trial
 
 from deepracer_exp.config.sweep import SweepConfig
 from deepracer_exp.errors import BadInput
-from deepracer_exp.sweeps.search.pruners import FirstOf, PruneDecision, build_pruner, is_worse_across_seeds
-from deepracer_exp.sweeps.trial import SeedRun, runs_as_json
+from deepracer_exp.sweeps.search.pruners import FirstOf, PruneDecision, build_pruner
 
 from . import studies
 
@@ -95,7 +94,7 @@ def test_a_patient_pruner_waits_while_a_trial_improves():
             assert pruned_at(study, patient, stuck)[0] == 5
 
 
-@pytest.mark.parametrize("pruners", [(), ("entropy",), ("wilcoxon",)])
+@pytest.mark.parametrize("pruners", [(), ("entropy",)])
 def test_pruners_that_compare_no_evaluations_let_every_trial_continue(pruners):
     assert pruned_at(study_of(SIX), build_pruner(settings(*pruners)), [99, 99, 99]) is None
 
@@ -106,49 +105,3 @@ def test_pruners_that_compare_one_score_are_refused_with_several_objectives():
     with pytest.raises(BadInput, match=refusal):
         build_pruner(settings("entropy", "median", objectives=objectives))
     build_pruner(settings("entropy", objectives=objectives))
-
-
-def seeded(*trials: Sequence[float], direction: str = "minimize") -> optuna.Study:
-    """Return a study of complete trials with these values by seed."""
-    study = optuna.create_study(direction=direction)
-    for values in trials:
-        runs = runs_as_json(SeedRun(seed=seed, values=[value]) for seed, value in enumerate(values))
-        study.add_trial(create_trial(value=sum(values) / len(values), user_attrs={"runs": runs}))
-    return study
-
-
-FIVE = (10, 20, 30, 40, 50)
-
-
-@pytest.mark.parametrize(
-    ("best", "values", "is_worse"),
-    [
-        # One seed says nothing; then the trial must be worse on every seed so far, with one left.
-        ((30, 32, 31), [36], False),
-        ((30, 32, 31), [36, 35], True),
-        ((30, 32, 31), [36, 31], False),
-        ((30, 32, 31), [29, 31], False),
-        # Seed by seed and not by their mean: worse than the same seed by less than the seeds differ.
-        (FIVE, [11, 21, 31, 41], True),
-        (FIVE, [41, 31, 21, 11], False),
-        # More seeds need more lost seeds.
-        ((30, 32, 31, 33), [36, 35], False),
-        ((30, 32, 31, 33), [36, 35, 37], True),
-        ((30, 32, 31, 33, 30, 31), [36, 35, 37], False),
-        # Two seeds leave none to compare.
-        ((30, 32), [36], False),
-    ],
-)
-def test_wilcoxon_prunes_a_trial_that_is_worse_than_the_best_one_seed_by_seed(best, values, is_worse):
-    assert is_worse_across_seeds(seeded((40, 42, 41), best), values) == is_worse
-
-
-def test_wilcoxon_follows_the_direction_and_needs_a_best_trial():
-    study = seeded([90, 92, 91], direction="maximize")
-    assert is_worse_across_seeds(study, [60, 70])
-    assert not is_worse_across_seeds(study, [95, 96])
-    assert not is_worse_across_seeds(seeded(), [36, 35])
-    study = optuna.create_study(directions=["minimize", "maximize"])
-    study.add_trial(create_trial(values=[30, 90]))
-    assert not is_worse_across_seeds(study, [36, 35])
-    build_pruner(settings("entropy", "wilcoxon", objectives=("lap_time", "completion")))

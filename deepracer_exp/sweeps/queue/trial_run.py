@@ -30,7 +30,7 @@ from deepracer_exp.runs.files import (
 from deepracer_exp.runs.folder import is_held
 from deepracer_exp.runs.result import FAILED, FINISHED, INTERRUPTED, STOPPED_EARLY, Ending
 from deepracer_exp.sweeps.search.objectives import intermediate_value, objective_values
-from deepracer_exp.sweeps.search.pruners import FirstOf, PruneDecision, is_worse_across_seeds
+from deepracer_exp.sweeps.search.pruners import FirstOf, PruneDecision
 from deepracer_exp.sweeps.trial import Interrupted, SeedRun, Trial, runs_as_json
 from deepracer_exp.tracking.metadata import PARENT, STUDY
 from deepracer_exp.tracking.metrics import trial_metrics
@@ -158,20 +158,13 @@ class TrialRun(Callback):
         return self._study.pruner.decide(self._study, self._storage.get_trial(self._trial_id))
 
     def _ended(self, overrides: list[str]) -> Trial:
-        config = self._config.config
-        for seed in range(config.seeds):
+        for seed in range(self._config.config.seeds):
             self._seed = seed
             if self._run is None or self._run.status is None:
                 self._record(self._made(overrides))
             run = self._runs[seed]
             if run.status in _STATES:
                 return self._as_trial(_STATES[run.status])
-            so_far = [run.values[0] for run in self._runs if run.values]
-            is_last = len(so_far) == config.seeds
-            if not is_last and "wilcoxon" in config.pruners and is_worse_across_seeds(self._study, so_far):
-                reason = f"worse than the best trial on {len(so_far)} seeds"
-                self._runs[seed] = replace(run, ending="wilcoxon", reason=reason)
-                return self._as_trial("PRUNED")
         by_seed = [run.values for run in self._runs if run.values]
         return self._as_trial(
             "COMPLETE", [sum(column) / len(column) for column in zip(*by_seed, strict=True)]

@@ -27,7 +27,6 @@ ENDINGS: Mapping[str, EndingStyle] = {
     "median": EndingStyle("#CC79A7", "worse than the median of the others at the same point"),
     "percentile": EndingStyle("#882255", "not among the best share of the others at the same point"),
     "hyperband": EndingStyle("#A060E0", "lost its bracket"),
-    "wilcoxon": EndingStyle("#332288", "lost to the best trial, seed by seed"),
     "pruned": EndingStyle("#A04080", "worse than the others"),
     "failed": EndingStyle("#000000", "ended by an error"),
     "running": EndingStyle("#9A9A9A", "still running"),

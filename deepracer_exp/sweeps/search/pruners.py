@@ -4,10 +4,9 @@ The pruner `entropy` is none of them: it is the stopping rule that each trial tr
 """
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
-import numpy as np
 from optuna.exceptions import ExperimentalWarning
 from optuna.pruners import (
     BasePruner,
@@ -16,15 +15,11 @@ from optuna.pruners import (
     PatientPruner,
     PercentilePruner,
 )
-from optuna.study import Study, StudyDirection
-from optuna.trial import FrozenTrial, TrialState
+from optuna.study import Study
+from optuna.trial import FrozenTrial
 
 from deepracer_exp.config.sweep import SweepConfig
 from deepracer_exp.errors import BadInput
-from deepracer_exp.sweeps.trial import Trial
-
-_LEVEL = 0.1
-"""Significance level of Wilcoxon's test: how often a trial as good as the best one may be pruned."""
 
 
 class PruneDecision(NamedTuple):
@@ -61,7 +56,7 @@ class FirstOf(BasePruner):
 
 
 def build_pruner(config: SweepConfig, evaluations: int | None = None) -> FirstOf:
-    """Build the pruners for running trials; wilcoxon compares seeds, see `is_worse_across_seeds`.
+    """Build the pruners for running trials.
 
     Args:
         config: of the sweep.
@@ -96,27 +91,3 @@ def build_pruner(config: SweepConfig, evaluations: int | None = None) -> FirstOf
                 for name, (pruner, kept) in chosen.items()
             }
     return FirstOf(chosen)
-
-
-def is_worse_across_seeds(study: Study, values: Sequence[float]) -> bool:
-    """Return whether these values are worse than the best trial's, seed by seed, by Wilcoxon's signed-rank test.
-
-    The significance level is 0.1; with fewer than five seeds it is the least the test can reach before the last
-    seed, 2^-(seeds - 1); after one seed no test can decide. With several objectives there is no best trial: False.
-    `values` are those of a trial's first seeds, in the order of the seeds.
-    """
-    complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-    if not complete or len(study.directions) > 1 or len(values) < 2:
-        return False
-    from scipy.stats import wilcoxon  # takes a second, and few sweeps use it
-
-    best = [run.values[0] for run in Trial.of(study.best_trial).runs if run.values]
-    # Its mean over more seeds would say nothing about these.
-    behind = np.subtract(values, best[: len(values)])
-    if study.direction == StudyDirection.MAXIMIZE:
-        behind = -behind
-    level = max(_LEVEL, 1.01 * 0.5 ** (len(best) - 1))
-    # zsplit: two seeds may be equal.
-    return bool(
-        behind.mean() > 0 and wilcoxon(behind, alternative="greater", zero_method="zsplit").pvalue < level
-    )

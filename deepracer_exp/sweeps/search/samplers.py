@@ -47,7 +47,7 @@ def build_sampler(config: SweepConfig, space: SearchSpace) -> BaseSampler:
             if config.sampler in SAMPLERS:
                 return _SAMPLERS[config.sampler](config, space, number, seed)
             chosen = OwnClass(target=config.sampler, kwargs={"seed": seed})
-            return build_own(chosen, "sweep.sampler", BaseSampler)
+            return build_own(chosen, "sweep.sampler", BaseSampler)  # type: ignore[type-abstract]
 
     if config.sampler not in SAMPLERS:
         make(0)
