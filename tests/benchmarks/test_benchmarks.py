@@ -7,12 +7,9 @@ from typing import Any
 
 import pytest
 
-from benchmarks import all_tracks, generalisation, sb3_peer, throughput, time_to_lap
-from benchmarks.report import median
-from benchmarks.throughput import PASS_STEPS, SameDriving, scalar_setup
+from benchmarks import all_tracks, generalisation, throughput, time_to_lap
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.tracks.track import world_track
 
 # One process and one iteration; any 3 episodes count as reliable.
 SHORTEST = (
@@ -29,23 +26,6 @@ SHORTEST = (
 @pytest.fixture(scope="module")
 def experiment() -> Experiment:
     return compose_experiment(["experiment=tiny", "collector=in_process", "collector.cars=16"])[0]
-
-
-def test_bare_physics_and_environment_drive_the_same_way_every_time(experiment: Experiment) -> None:
-    same = SameDriving(experiment, 3)
-    ended = []
-    for _ in range(2):
-        assert same.env_pass_s() > 0
-        ended.append(same._env.race.state_arrays()["physics_state"])
-        assert same.physics_pass_s() > 0  # asserts the state it ends in
-    assert (ended[0] == ended[1]).all()
-    assert len(same._noted) == PASS_STEPS
-
-
-def test_the_scalar_reward_is_the_experiments_without_its_batch_form(experiment: Experiment) -> None:
-    text = scalar_setup(experiment).reward.text
-    assert "def reward_function" in text
-    assert "reward_batch" not in text
 
 
 def test_throughput_reports_the_documented_figures_and_holds_the_training_against_the_faster_peer(
@@ -75,24 +55,6 @@ def test_throughput_reports_the_documented_figures_and_holds_the_training_agains
     assert summary["ratios"]["train_to_peer"]["median"] == 1.5
     assert summary["ratios"]["train_to_default_peer"]["median"] == 2
     assert "wanted" in throughput.show(summary)
-
-
-def test_passes_are_measured_in_turns_each_for_its_seconds() -> None:
-    calls = []
-
-    def one_pass(name: str) -> tuple[float, float]:
-        calls.append(name)
-        return 10.0, 2.0
-
-    rates = throughput.in_turns(2, 3.0, {"a": lambda: one_pass("a"), "b": lambda: one_pass("b")})
-    assert calls == ["a", "a", "b", "b"] * 2
-    assert rates == {"a": [5.0, 5.0], "b": [5.0, 5.0]}
-
-
-def test_the_peer_trains_on_as_many_frames_as_the_experiment_has(experiment: Experiment) -> None:
-    result = sb3_peer.measure(experiment, iterations=2, physics_threads=1, torch_threads=1)
-    assert result["env_steps"] == 2 * (experiment.algorithm.frames_per_iteration or 0)
-    assert result["steps_per_s"] > 0
 
 
 @pytest.mark.slow
@@ -129,24 +91,6 @@ def test_all_tracks_writes_a_row_for_each_track_and_a_table(
     assert "not in 1,024 (0%)" in line
 
 
-def test_the_tracks_seen_and_unseen_follow_from_widths_alone() -> None:
-    left_out = (
-        "Straight_track",
-        "reinvent_carpet",
-        "reinvent_concrete",
-        "reinvent_wood",
-        "Monaco",
-        "caecer_loop",
-    )
-    widths_m = {name: round(world_track(name).width_m, 3) for name in all_tracks.TRACKS}
-    ordered = sorted(widths_m.keys() - set(left_out), key=lambda name: (widths_m[name], name))
-    pairs = [ordered[place : place + 2] for place in range(0, len(ordered), 2)]
-    seen = [pair[turn % 2] for turn, pair in enumerate(pairs)]
-    assert tuple(seen) == generalisation.SEEN
-    assert tuple(name for pair in pairs for name in pair if name not in seen) == generalisation.UNSEEN
-    assert generalisation.ONE in seen
-
-
 def test_a_policy_drives_every_track_both_ways_from_every_start(trained: Callable[..., Any]) -> None:
     run = trained("budget.iterations=1").folder
     both = generalisation.drive(run, ["Oval_track", "Bowtie_track"], starts=3)
@@ -155,27 +99,3 @@ def test_a_policy_drives_every_track_both_ways_from_every_start(trained: Callabl
     for driven in both.values():
         assert 0 < driven.completion < 1
         assert driven.laps == 0
-
-
-def test_generalisation_is_the_mean_over_seeds_and_tracks() -> None:
-    def driven(seen: float, unseen: float) -> dict[str, generalisation.Driven]:
-        lists = ((generalisation.SEEN, seen), (generalisation.UNSEEN, unseen))
-        return {track: generalisation.Driven(share, share / 2) for tracks, share in lists for track in tracks}
-
-    seeds = [
-        {"six": driven(1.0, 0.9), "one": driven(0.8, 0.2)},
-        {"six": driven(0.9, 0.6), "one": driven(0.6, 0.4)},
-    ]
-    summary = generalisation.summarize(seeds)
-    assert (summary["unseen_completion"], summary["seen_completion"]) == (0.75, 0.95)
-    assert summary["unseen_laps"] == 0.375
-    assert (summary["one_track"]["unseen_completion"], summary["one_track"]["seen_completion"]) == (0.3, 0.7)
-    assert [seed["six_tracks"]["unseen_completion"] for seed in summary["seeds"]] == [0.9, 0.6]
-    assert [row["track"] for row in summary["tracks"] if row["seen"]] == list(generalisation.SEEN)
-    assert "0.750" in generalisation.markdown(summary).splitlines()[-1]
-
-
-def test_what_never_happened_took_longer_than_anything() -> None:
-    assert median([3.0, None, 1.0]) == 3.0
-    assert median([None, None, 1.0]) is None
-    assert median([1.0, None]) is None

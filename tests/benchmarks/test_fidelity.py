@@ -7,7 +7,6 @@ import pytest
 
 from benchmarks import fidelity
 from benchmarks.calibrate import PARAMETERS, fit
-from benchmarks.fidelity import Formula, bicycle, fit_formula
 from benchmarks.recorded import BANDS, car_named, read_recorded
 from benchmarks.replay import PERIOD_S, WARM_UP_STEPS, Windows, errors, replay
 
@@ -29,36 +28,6 @@ def windows(count: int, steps: int = 15) -> Windows:
         iteration=np.arange(count),
         episode=np.arange(count),
     )
-
-
-def test_the_bicycle_drives_the_circle_of_its_wheelbase_and_steering():
-    some = windows(1, steps=60)
-    some.action[...] = (1.0, 0.3)
-    path = bicycle(CAR, some)[0]
-    # Three points of a circle give its radius; the origin is ahead of the rear axle by its distance to it.
-    a, b, c = (complex(*path[i, :2]) for i in (0, 25, 50))
-    area = 0.5 * abs(((b - a).conjugate() * (c - a)).imag)
-    radius_m = abs(a - b) * abs(b - c) * abs(c - a) / (4 * area)
-    assert radius_m == pytest.approx(np.hypot(CAR.wheelbase_m / np.tan(0.3), CAR.rear_axle_x_m), rel=1e-3)
-    # Its rear axle goes at the commanded speed.
-    assert (path[-1, 2] - path[0, 2]) * 15 / 59 == pytest.approx(np.tan(0.3) / CAR.wheelbase_m)
-
-
-def test_a_formula_without_lag_and_loss_turns_as_the_bicycle_does():
-    some = windows(1)
-    some.action[...] = (1.5, 0.1)
-    formula = Formula(speed_lag_s=1e-3, rate_lag_s=1e-3, gain=1.0, gain_loss=0.0)
-    turned = [np.diff(path[0, :, 2])[-1] for path in (formula.predict(CAR, some), bicycle(CAR, some))]
-    assert turned[0] == pytest.approx(turned[1])
-
-
-def test_fitting_the_formula_finds_the_formula_that_drove():
-    some = windows(60)
-    driven = Formula(gain=0.55, rate_lag_s=0.3, speed_lag_s=0.15, trim_rad=0.03)
-    some.truth[...] = driven.predict(CAR, some)
-    found = fit_formula(CAR, some)
-    assert np.median(errors(found.predict(CAR, some), some).distance_m) < 1e-3
-    assert found.rate_lag_s == pytest.approx(0.3, rel=0.02)
 
 
 def test_each_version_is_measured_with_its_own_car_by_band_and_recording_and_drawn(
@@ -137,22 +106,3 @@ def test_a_recording_left_out_is_predicted_by_a_car_that_has_not_seen_it(
     low, high = sorted(of["one_second_error_m"] for of in each)
     assert low <= figures["bands"]["all"]["one_second_error_m"] <= high
     assert f"{first.name}: " in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--traces", "nowhere"], "nowhere: no such file or folder"),
-        (["--traces", ".", "--car", "lorry"], "lorry"),
-        (
-            ["--traces", ".", "--leave-one-out", "--car", "ideal"],
-            "--leave-one-out --car: accepted: one of the two",
-        ),
-    ],
-)
-def test_bad_input_is_refused_in_one_line(arguments, words, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert fidelity.main(arguments) == 2
-    error = capsys.readouterr().err.strip()
-    assert words in error
-    assert "\n" not in error

@@ -12,20 +12,6 @@ from benchmarks import longer
 from deepracer_exp.analysis.evidence import estimate
 
 
-@pytest.mark.parametrize(
-    ("laps_s", "rise"),
-    [
-        ([8.0, 7.0, 7.14, 6.5], 0.02),  # against the fastest before, not the last or the first
-        ([np.inf, 8.0, 7.6], -0.05),
-        ([np.inf, 8.0], 0.0),
-        ([8.0, np.inf, 7.0], None),
-        ([np.inf, np.inf], None),
-    ],
-)
-def test_the_worst_rise_is_above_the_fastest_lap_before(laps_s: list[float], rise: float | None) -> None:
-    assert longer.worst_rise(np.array(laps_s)) == rise
-
-
 def test_each_seed_of_each_group_is_trained_once_and_laps_are_held_against_the_bound(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -68,8 +54,3 @@ def test_each_seed_of_each_group_is_trained_once_and_laps_are_held_against_the_b
     assert figures["over_bound"] == pytest.approx(9.15 / 8 - 1, abs=1e-4)
     assert figures["over_bound_end"] == pytest.approx(8.75 / 8 - 1, abs=1e-4)
     assert "`reinvent_base`, fast_lap" in capsys.readouterr().out
-
-
-def test_an_unknown_recipe_is_refused_before_anything_is_trained(capsys: pytest.CaptureFixture[str]) -> None:
-    assert longer.main(["--recipes", "default,fastest_lap", "--tracks", "Oval_track"]) == 2
-    assert capsys.readouterr().err.startswith("experiment=fastest_lap: no such experiment")

@@ -11,8 +11,3 @@ def test_crashes_of_a_recorded_training_with_a_bot_are_found_to_one_row_in_a_tho
     assert figures["wrong_rows"] <= figures["rows"] / 1000
     assert figures["crashes_found"] >= 8
     assert len(figures["recordings"][0]["mismatches"]) == figures["wrong_rows"]
-
-
-def test_a_folder_without_such_a_recording_is_refused(tmp_path, capsys):
-    assert others.main(["--traces", str(tmp_path)]) == 2
-    assert "no recording with others" in capsys.readouterr().err

@@ -8,27 +8,8 @@ from pathlib import Path
 import pytest
 
 from benchmarks import races
-from benchmarks.report import over_seeds
-from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.evaluation import EvaluationConfig
 from tests.conftest import Ended
-
-
-def test_a_seed_without_a_lap_is_slower_than_any() -> None:
-    assert over_seeds([8.0, None, 9.0, 8.5])["iqm"] == 8.75
-    lost = over_seeds([8.0, None, None, 8.5])
-    assert lost["iqm"] is None
-    assert lost["interval"][1] is None
-
-
-def test_the_car_of_the_board_trains_among_the_others_of_the_board() -> None:
-    boxes = next(board for board in races.BOARDS if board.race == "six_boxes")
-    own, of_board = (
-        compose_experiment(races.training_overrides(boxes, car, []))[0] for car in (races.OWN, races.OF_BOARD)
-    )
-    assert (own.race.boxes.placement, own.race.boxes.count, own.car.name) == ("random", 3, "deepracer_v6")
-    assert (of_board.race.boxes.placement, of_board.race.boxes.count) == ("fixed", 6)
-    assert of_board.car.name == "deepracer_v4"
 
 
 def test_each_seed_of_each_board_is_trained_once(
@@ -59,13 +40,6 @@ def test_each_seed_of_each_board_is_trained_once(
     assert boxes["lap_s"]["seeds"] == [8.0, None, 9.0]
     assert boxes["crash_free"]["iqm"] == 0.5
     assert "head_to_bot, reInvent2019_track, deepracer_v6" in capsys.readouterr().out
-
-
-def test_a_track_without_a_board_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert races.main(["--tracks", "Oval_track"]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("--tracks Oval_track: ")
-    assert "Spain_track" in error
 
 
 def test_a_board_with_boxes_is_raced_among_its_own_and_among_those_elsewhere(

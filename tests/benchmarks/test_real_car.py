@@ -9,37 +9,8 @@ import pytest
 import torch
 
 from benchmarks import real_car
-from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.evaluation.evaluate import CAR, SIMULATOR
 from deepracer_exp.export.car_converter import has_openvino
 from tests.conftest import Ended
-
-
-def test_a_training_without_an_ingredient_differs_in_that_alone() -> None:
-    whole = compose_experiment(real_car.training_overrides("reinvent_base", None, []))[0]
-    assert whole.randomization.real_car is not None
-    for without, changed in {
-        "car": {"randomization": compose_experiment(["randomization=sim2real"])[0].randomization},
-        "off_road_cost": {"reward": compose_experiment([])[0].reward},
-        "speeds": {"action_space": compose_experiment([])[0].action_space},
-        "sim2real": {"randomization": compose_experiment([])[0].randomization},
-    }.items():
-        other = compose_experiment(real_car.training_overrides("reinvent_base", without, []))[0]
-        assert other == replace(whole, **changed) != whole
-
-
-def test_a_policy_drives_in_the_simulator_under_sim2real_and_as_the_car_in_parts() -> None:
-    protocols = real_car.protocols()
-    assert list(protocols) == [SIMULATOR, "sim2real", "picture", "timing", "controls", CAR, "car_sim2real"]
-    usual = {name: config.usual for name, config in protocols.items()}
-    assert usual == {name: "sim2real" if "sim2real" in name else "none" for name in protocols}
-    assert protocols[SIMULATOR].real_car is protocols["sim2real"].real_car is None
-    assert protocols[CAR].real_car == protocols["car_sim2real"].real_car
-    assert None not in vars(protocols[CAR].real_car).values()
-    # None of its starts is one of the training's evaluations.
-    trained = compose_experiment(["experiment=real_car"])[0].evaluation
-    starts = {round(start * trained.trials * 2, 6) for start in protocols[CAR].starts}
-    assert not any(start == round(start) for start in starts)
 
 
 def test_each_seed_is_trained_whole_and_without(
@@ -85,23 +56,6 @@ def test_each_seed_is_trained_whole_and_without(
     out = capsys.readouterr().out
     assert "| Oval_track, nothing |" in out
     assert "95% (simulator), 90% (sim2real), 90% (car)" in out
-
-
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [
-        (("--without", "luck"), "--without luck"),
-        (("--tracks", "nowhere"), "nowhere"),
-        (("--seeds", "0"), "--seeds"),
-        (("--frames", "nowhere"), "--frames nowhere"),
-    ],
-    ids=" ".join,
-)
-def test_what_is_unknown_is_refused_before_a_training(
-    words: tuple[str, ...], named: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert real_car.main(list(words)) == 2
-    assert named in capsys.readouterr().err
 
 
 def test_a_run_is_measured_under_each_condition(

@@ -1,15 +1,12 @@
 """The comparison of PPO, SAC and Stable-Baselines3's SAC asks each for the same, and takes figures from their runs."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from benchmarks import sac, sb3_sac
-from benchmarks.fresh import Driven
 from deepracer_exp.config.compose import compose_experiment
-from tests.conftest import Ended
 
 
 def test_compared_trainings_begin_one_after_the_other_and_differ_by_the_algorithm_alone(
@@ -41,33 +38,6 @@ def test_compared_trainings_begin_one_after_the_other_and_differ_by_the_algorith
     assert "Oval_track, continuous, sb3_sac" in capsys.readouterr().out
 
 
-def test_a_run_is_reliable_at_its_first_row_with_enough_laps(
-    trained: Callable[..., Ended], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run = trained("budget.iterations=1").folder
-    (row,) = trained("budget.iterations=1").metrics
-    shares = (None, 0.88, 0.9, 0.96)
-    rows = [row | {"lap_share": share, "env_steps": 100 * place} for place, share in enumerate(shares)]
-    laps = Driven(
-        completion=90.0, lap_share=0.5, lap_time_s=9.0, held_out_completion=0.0, held_out_lap_time_s=None
-    )
-    monkeypatch.setattr(sac, "read_metrics", lambda _: rows)
-    monkeypatch.setattr(sac, "drive", lambda *_: [laps])
-    found = sac.measure(run)
-    assert (found["reliable_steps"], found["lap_s"], found["lap_share"]) == (200, 9.0, 0.5)
-
-
-def test_the_peer_learns_as_often_as_ours_from_as_many_steps() -> None:
-    overrides = sac.Asked("Oval_track", "continuous", sac.PEER).overrides(1.0, ["collector.cars=64"])
-    experiment = compose_experiment(overrides)[0]
-    peer = sb3_sac.build(experiment, sb3_sac.Watch(10.0))
-    assert (peer.train_freq.frequency, peer.n_envs) == (64, 64)
-    assert peer.gradient_steps == 64
-    assert (peer.batch_size, peer.tau, peer.target_entropy) == (512, 0.05, -2.0)
-    assert peer.replay_buffer.buffer_size * peer.n_envs <= experiment.algorithm.replay_steps
-    peer.env.close()
-
-
 def test_the_peer_trains_for_its_seconds_and_drives_laps() -> None:
     overrides = sac.Asked("Oval_track", "continuous", sac.PEER).overrides(1.0, ["collector.cars=64"])
     found = sb3_sac.measure(compose_experiment(overrides)[0], seconds=1.0, trials=2)
@@ -75,8 +45,3 @@ def test_the_peer_trains_for_its_seconds_and_drives_laps() -> None:
     assert found["train_s"] >= 1.0
     assert found["reliable_s"] is None
     assert 0 <= found["lap_share"] <= 1
-
-
-def test_no_time_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert sac.main(["--minutes", "0"]) == 2
-    assert capsys.readouterr().err.startswith("--minutes 0: ")
