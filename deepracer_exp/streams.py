@@ -17,7 +17,7 @@ _ACCOUNT = re.compile(
     r"(?!(?:19|20)\d\d(?:0[1-9]|1[0-2])(?:0[1-9]|[12]\d|3[01])(?:[01]\d|2[0-3])[0-5]\d)\d{12}(?!\d)"
 )
 _CLOSED_PIPE = 141
-"""Exit code of a program whose output nobody reads: 128 and the number of SIGPIPE."""
+"""Exit code of a program whose output is no longer read: 128 and the number of SIGPIPE."""
 
 
 def without_accounts(text: str) -> str:

@@ -30,7 +30,7 @@ def test_a_full_disk_takes_one_line(tmp_path, argument):
 
 @pytest.fixture
 def closed_pipe():
-    """Yield the writing end of a pipe that nobody reads."""
+    """Yield the writing end of a pipe that has no reader."""
     reading, writing = os.pipe()
     os.close(reading)
     yield writing

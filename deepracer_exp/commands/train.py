@@ -170,8 +170,8 @@ _RESUME_EPILOG = """\
                                                             budget is used
 
 The run continues from its last checkpoint, in its own folder and in the same MLflow run; what it wrote after that
-checkpoint is overwritten. The result equals that of an uninterrupted run, bit for bit, except with a budget in minutes
-or money or one that several runs share. A reward function that keeps something between calls starts without it.
+checkpoint is overwritten. The result equals that of an uninterrupted run, bit for bit, except with a budget in
+minutes. A reward function that keeps something between calls starts without it.
 With a larger budget a learning rate and an entropy bonus that follow the budget rise again, which is said;
 budget.schedule_until=0.5 holds them with twice the budget.
 """

@@ -157,7 +157,7 @@ def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
             what = "train it further on changing conditions, at a tenth of the learning rate"
             return [(f"{clone} randomization=sim2real", what), *steps]
         steps.append((f"{resume} stopping=none", "continue it until its budget is used"))
-    elif limit in spent:  # else the rest of an experiment's budget decides
+    else:
         budget = {key: most for key, most in config["budget"].items() if key in spent and most is not None}
         again = {key: (most, _twice(spent[key])) for key, most in budget.items() if spent[key] >= most}
         words = [f"budget.{key}={twice}" for key, (_, twice) in again.items()]
