@@ -51,7 +51,10 @@ from .worker_config import RUN_ID, WorkerConfig, plan_trial
 Value = TypeVar("Value")
 
 _KEEPS = {"report": "false", "trace": "laps"}
-"""What a trial's run keeps unless its overrides say more: all steps were two thirds of a study's disk."""
+"""What a trial's run keeps unless its overrides say more.
+
+Traces are two thirds of a study's disk; laps save an eighth of them where most steps are of laps, as on short tracks.
+"""
 _MOST_TRIES = 3
 """How often a run is started or resumed at the same checkpoint if its process is lost each time."""
 _STATES = {FAILED: "FAIL", STOPPED_EARLY: "PRUNED"}
