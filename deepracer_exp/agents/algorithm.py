@@ -57,6 +57,10 @@ class Algorithm:
         """
         self.networks, self.config, self.schedule = networks, config, schedule
 
+    def __str__(self) -> str:
+        """Return its name for the first line of a training."""
+        return type(self).__name__
+
     def rates(self, iteration: int, fraction: float) -> dict[str, float]:
         """Return what the schedules lead to in the coming update, by its name; arguments as of `update`."""
         return {"learning rate": self.config.lr * self.schedule.factor(iteration, fraction)}

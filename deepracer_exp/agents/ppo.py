@@ -101,6 +101,10 @@ class PPO(Algorithm):
         """Return the compiled loop that makes the gradient steps of `loss`; None where autograd makes them."""
         return self._compiled if type(self).loss is PPO.loss else None
 
+    def __str__(self) -> str:
+        """Return its name and what makes the gradient steps."""
+        return f"{type(self).__name__}, {'compiled' if self._inner_loop is not None else 'by its loss in autograd'}"
+
     def loss(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return the losses of a minibatch; override it for a loss of your own.
 

@@ -287,6 +287,7 @@ class DisplayCallback(Callback):
                 reward=names["reward"],
                 network=names["network"],
                 actions=names["action_space"],
+                algorithm=str(trainer.agent),
                 budget=str(trainer.budget),
                 folder=str(trainer.folder.path),
             )

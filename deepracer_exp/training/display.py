@@ -96,6 +96,8 @@ class RunHeader:
     reward: str
     network: str
     actions: str
+    algorithm: str
+    """Name of the algorithm, and what makes its gradient steps where there is a choice."""
     budget: str
     """The limits of the run, such as `3,000,000 steps`."""
     folder: str
@@ -103,7 +105,7 @@ class RunHeader:
 
     def __str__(self) -> str:
         """Return the choices in one line."""
-        return " · ".join((self.track, self.reward, self.network, self.actions))
+        return " · ".join((self.track, self.reward, self.network, self.actions, self.algorithm))
 
 
 class ProgressDisplay:

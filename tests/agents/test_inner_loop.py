@@ -66,6 +66,7 @@ def test_many_updates_end_where_those_of_torchrls_loss_do(actions):
     networks, ppo = make(actions=actions)
     same, plain = make(actions=actions, compiled=False)
     assert plain._inner_loop is None
+    assert (str(ppo), str(plain)) == ("PPO, compiled", "PPO, by its loss in autograd")
     train(networks, ppo, 5)
     train(same, plain, 5)
     assert (parameters(networks) - parameters(same)).norm() < 1e-3 * parameters(same).norm()

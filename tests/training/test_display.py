@@ -24,7 +24,12 @@ from tests.waiting import wait_until
 
 HEADER = RunHeader(
     **{"name": "default", "track": "re:Invent 2018", "track_labels": (), "remembered": 20},
-    **{"reward": "progress_delta", "network": "mlp_small", "actions": "[15] actions [/] :car:"},
+    **{
+        "reward": "progress_delta",
+        "network": "mlp_small",
+        "actions": "[15] actions [/] :car:",
+        "algorithm": "PPO",
+    },
     **{"budget": "3,000,000 steps", "folder": "runs/default/20260101-120000-reinvent_base"},
 )
 ROW = {
