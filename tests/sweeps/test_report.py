@@ -40,6 +40,18 @@ def test_the_next_steps_name_the_classes_of_the_winner_again(tmp_path):
     assert f"clone best:{study.study_name} network.target=my_network:Net stopping.target=my_rule:Rule" in page
 
 
+def test_the_next_steps_say_where_the_runs_are_unless_they_are_in_the_usual_place(tmp_path):
+    study = new_study(tmp_path)
+    add(study, [9.5], metrics=3)
+    name = study.study_name
+    assert "runs_dir=" not in study_page(study)
+    study.set_user_attr("base", ["seed=1", "runs_dir=else where"])
+    page = Html(study_page(study)).text
+    assert f"evaluate best:{name} 'runs_dir=else where' --video lap.mp4" in page
+    assert f"clone best:{name} 'runs_dir=else where'" in page
+    assert f"sweep study={name} 'runs_dir=else where' sweep.trials=" in page
+
+
 @needs_chromium
 def test_a_browser_draws_all_of_it_asks_for_nothing_and_offers_no_upload(study, tmp_path, tab):
     path = write_study_page(study, tmp_path / "report.html")

@@ -9,6 +9,7 @@ from typing import Any
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
+from deepracer_exp.config.overrides import key_of
 from deepracer_exp.config.own_class import OF_POLICY
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.files import atomic_write, read_bytes
@@ -23,7 +24,6 @@ from deepracer_exp.sweeps.search.objectives import (
     objectives_of,
     shown,
     shown_or_dash,
-    shown_values,
 )
 from deepracer_exp.sweeps.trial import Trial
 
@@ -71,7 +71,8 @@ def study_page(study: optuna.Study) -> str:
         best=best_trial(study).number if complete else None,
         winners=_winners(study, objectives, keys),
         seeds=over_seeds(study, keys),
-        objective=of_conditions(MEASURES[objectives[0]].words, _has_held_out(trials)),
+        objective=_words(objectives[:1], trials),
+        objectives=_words(objectives, trials).capitalize(),
         too_few=FEWEST_COMPLETE if len(complete) < FEWEST_COMPLETE else None,
         trials=_table(study, objectives, keys),
         laps={"training": TRAINING_LAPS, "sweep": SWEEP_LAPS, "fresh": FRESH_LAPS},
@@ -135,17 +136,24 @@ def _next_steps(study: optuna.Study) -> list[tuple[str, str]]:
     except BadInput:  # moved or removed since
         config = {}
     evaluate = command_line("evaluate", winner, config, OF_POLICY)
+    clone = command_line("clone", winner, config)
+    where = "".join(f" {shlex.quote(word)}" for word in _where(study))
     more = 2 * int(study.user_attrs.get("trials", len(study.trials)))
     return [
         (best_line(study), "train the winner again"),
-        (f"{evaluate} --video lap.mp4", "race it, and film its fastest usual lap"),
-        (command_line("clone", winner, config), "train it further, at a tenth of the learning rate"),
+        (f"{evaluate}{where} --video lap.mp4", "race it, and film its fastest usual lap"),
+        (f"{clone}{where}", "train it further, at a tenth of the learning rate"),
         (f"{_resume(study)} sweep.trials={more}", "continue the search, with twice the trials"),
     ]
 
 
 def _resume(study: optuna.Study) -> str:
-    return shlex.join([COMMAND, "sweep", f"study={study.study_name}"])
+    return shlex.join([COMMAND, "sweep", f"study={study.study_name}", *_where(study)])
+
+
+def _where(study: optuna.Study) -> list[str]:
+    """Return the override that says where the study's runs are, if it was given one."""
+    return [word for word in study.user_attrs.get("base") or () if key_of(word) == "runs_dir"]
 
 
 def _picture(study: optuna.Study) -> str | None:
@@ -184,6 +192,11 @@ def _has_held_out(trials: Sequence[FrozenTrial]) -> bool:
     return any(Trial.of(trial).held_out_completion is not None for trial in trials)
 
 
+def _words(objectives: Sequence[str], trials: Sequence[FrozenTrial]) -> str:
+    """Return what the objectives are called."""
+    return ", ".join(of_conditions(MEASURES[name].words, _has_held_out(trials)) for name in objectives)
+
+
 def _winners(study: optuna.Study, objectives: Sequence[str], keys: dict[str, str]) -> list[dict[str, Any]]:
     """Return the re-ranked trials, the best on fresh laps first."""
     by_number = {trial.number: trial for trial in complete_trials(study)}
@@ -194,8 +207,8 @@ def _winners(study: optuna.Study, objectives: Sequence[str], keys: dict[str, str
         tables.append(
             {
                 "trial": trial.number,
-                "now": shown_values(objectives, laps.values, laps.held_out_completion is not None),
-                "before": shown_values(objectives, trial.values, laps.held_out_completion is not None),
+                "now": ", ".join(map(shown, objectives, laps.values)),
+                "before": ", ".join(map(shown, objectives, trial.values)),
                 "interval": " to ".join(shown(objectives[0], end) for end in laps.interval),
                 "lap_time": shown_or_dash("lap_time", laps.lap_time_s),
                 "completion": shown_or_dash("completion", laps.completion),
@@ -277,10 +290,8 @@ def _failures(trials: Sequence[FrozenTrial]) -> list[dict[str, Any]]:
 
 def _facts(study: optuna.Study, objectives: Sequence[str]) -> list[tuple[str, str]]:
     attrs = study.user_attrs
-    has_held_out = _has_held_out(study.get_trials(deepcopy=False))
-    words = [of_conditions(MEASURES[name].words, has_held_out) for name in objectives]
     facts = [
-        ("Objective" + "s" * (len(objectives) > 1), ", ".join(words)),
+        ("Objective" + "s" * (len(objectives) > 1), _words(objectives, study.get_trials(deepcopy=False))),
         ("Evaluation", str(attrs.get("protocol", NONE))),
         ("Seeds of a trial", str(attrs.get("seeds", 1))),
         ("Runs", f"{attrs.get('runs_dir', 'runs')}/{study.study_name}"),
