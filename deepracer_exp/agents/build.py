@@ -31,7 +31,7 @@ def build_networks(
 ) -> PolicyNetworks:
     """Build the networks that an algorithm trains; arguments and errors as of `build_actor_critic`."""
     if isinstance(algorithm, SACConfig):
-        return build_soft_actor_critic(network, observed, action_count, generator, algorithm.value_network)
+        return build_soft_actor_critic(network, observed, action_count, generator)
     return build_actor_critic(network, observed, action_count, generator)
 
 

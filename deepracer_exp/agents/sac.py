@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torchrl.objectives import DiscreteSACLoss, HardUpdate, SACLoss, SoftUpdate
+from torchrl.objectives import DiscreteSACLoss, SACLoss, SoftUpdate
 
 from deepracer_exp.config.learning import SACConfig
 from deepracer_exp.errors import RunFailed
@@ -24,7 +24,6 @@ _CPU = torch.device("cpu")
 _LOSSES = {
     "loss_actor": "policy loss",
     "loss_qvalue": "loss of the critics",
-    "loss_value": "value loss",
     "loss_alpha": "loss of the temperature",
 }
 _DISTANCES = {"huber": "smooth_l1", "mean squared error": "l2"}
@@ -82,11 +81,7 @@ class SAC(Algorithm):
         self._losses: SACLosses | SACLoss | DiscreteSACLoss = (
             SACLosses(self._learner, self._loss, config) if fits else self._loss
         )
-        self._targets: SoftUpdate | HardUpdate
-        if config.tau is None:  # copies whenever it is asked to
-            self._targets = HardUpdate(self._loss, value_network_update_interval=0)
-        else:
-            self._targets = SoftUpdate(self._loss, eps=1 - config.tau)
+        self._targets = SoftUpdate(self._loss, eps=1 - config.tau)
         self._parameters = [weight for weight in self._loss.parameters() if weight.requires_grad]
         self._optimizer = torch.optim.Adam(self._parameters, lr=config.lr, eps=1e-5, fused=True)
         self._owed_steps = 0.0
@@ -103,7 +98,7 @@ class SAC(Algorithm):
         devices = [] if self._device == _CPU else [self._device]
         with torch.random.fork_rng(devices=devices):
             torch.manual_seed(seed)  # TorchRL draws the policy's actions from the global stream
-            table = [self._gradient_step(first=number == 0) for number in range(steps)]
+            table = [self._gradient_step() for _ in range(steps)]
         if steps:
             self._publish()
         means = torch.stack(table).mean(0).tolist() if table else [None] * 5
@@ -175,15 +170,7 @@ class SAC(Algorithm):
                 **options,
             )
         else:
-            # A value network alone has a delayed copy, as in the first version of the algorithm.
-            loss = SACLoss(
-                learner.policy_head,
-                critics,
-                learner.value,
-                delay_qvalue=learner.value is None,
-                target_entropy=config.target_entropy,
-                **options,
-            )
+            loss = SACLoss(learner.policy_head, critics, target_entropy=config.target_entropy, **options)
         return loss.to(self._device)
 
     def _steps_due(self, collected: int) -> int:
@@ -195,16 +182,12 @@ class SAC(Algorithm):
         self._owed_steps -= due
         return due
 
-    def _gradient_step(self, first: bool) -> Tensor:
-        """Make a gradient step and return the parts of SACMetrics; the `first` of an update may copy the targets."""
+    def _gradient_step(self) -> Tensor:
+        """Make a gradient step and return the parts of SACMetrics."""
         # A replay that is still smaller than a minibatch gives as many as the largest power of two in it.
         size = min(self.config.batch_size, 1 << (len(self.replay).bit_length() - 1))
-        if first and self.config.tau is None:
-            self._targets.step()
         losses = self._losses(self.replay.sample(size).to(self._device))
-        names = [
-            name for name in _LOSSES if name in losses and (name != "loss_alpha" or self.config.learn_alpha)
-        ]
+        names = [name for name in _LOSSES if name != "loss_alpha" or self.config.learn_alpha]
         loss = torch.stack([losses[name] for name in names]).sum()
         self._optimizer.zero_grad()
         loss.backward()
@@ -216,8 +199,7 @@ class SAC(Algorithm):
         if self.config.max_grad_norm:
             nn.utils.clip_grads_with_norm_(self._parameters, self.config.max_grad_norm, grad_norm)
         self._optimizer.step()
-        if self.config.tau is not None:
-            self._targets.step()
+        self._targets.step()
         entropy = losses["entropy"]
         q_value = -losses["loss_actor"].detach() - losses["alpha"] * entropy
         return torch.stack(
@@ -252,8 +234,6 @@ class SAC(Algorithm):
             TensorDict.from_module(critic).data.copy_(stack)
         if self._learner is not self.networks:
             self.networks.policy_head.load_state_dict(self._learner.policy_head.state_dict())
-            if self.networks.value is not None and self._learner.value is not None:
-                self.networks.value.load_state_dict(self._learner.value.state_dict())
 
     @torch.no_grad()
     def _take_networks(self) -> None:
@@ -262,7 +242,4 @@ class SAC(Algorithm):
             self._learner.load_state_dict(self.networks.state_dict())
         for number, critic in enumerate(self.networks.critics):
             self._loss.qvalue_network_params.data[number].copy_(TensorDict.from_module(critic).data)
-        for name in ("qvalue", "value"):
-            target = getattr(self._loss, f"target_{name}_network_params", None)
-            if target is not None:
-                target.data.copy_(getattr(self._loss, f"{name}_network_params").data)
+        self._loss.target_qvalue_network_params.data.copy_(self._loss.qvalue_network_params.data)

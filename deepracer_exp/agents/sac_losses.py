@@ -47,8 +47,8 @@ class SACLosses:
 
     @staticmethod
     def fits(learner: SoftActorCritic) -> bool:
-        """Return whether the critics are perceptrons of features, and there is no value network beside them."""
-        return learner.value is None and all(is_plain(_layers_of(critic)) for critic in learner.critics)
+        """Return whether the critics are perceptrons of features."""
+        return all(is_plain(_layers_of(critic)) for critic in learner.critics)
 
     def __call__(self, steps: TensorDictBase) -> dict[str, Tensor]:
         """Return `loss_actor`, `loss_qvalue`, `loss_alpha`, and without gradients `alpha` and `entropy`.

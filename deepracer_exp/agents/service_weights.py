@@ -117,7 +117,8 @@ def policy_of_sac(tensors: Mapping[str, Array], where: str) -> dict[str, Array]:
     The head of the service's policy begins with a hidden layer, here the last of the trunk; its means and the
     logarithms of its deviations come from a layer each, ours from one. A frozen graph has no deviations: they are
     `INITIAL_STD`.
-    The critics and the value of a state are left out: the service's see actions in degrees and metres per second.
+    The critics are left out, because the service's see actions in degrees and metres per second, and so is the network
+    for the value of a state, which ours have not.
 
     Args:
         tensors: by the service's names.

@@ -31,24 +31,19 @@ _LOG_STD = -20.0, 2.0
 
 
 class SoftActorCritic(PolicyNetworks):
-    """A policy, two critics, and where wanted the value of a state; they share no layers.
+    """A policy and two critics, which share no layers.
 
     Attributes:
         critics: Each reads what is seen and a continuous `action` -> `state_action_value` [..., 1]; or, for a list of
             n actions, only what is seen -> `action_value` [..., n].
-        value: What is seen -> `state_value` [..., 1]; None: the critics' targets come from the critics.
         action_count: Number of discrete actions, None for the continuous ones.
     """
 
     def __init__(
-        self,
-        policy_head: ProbabilisticActor,
-        critics: list[ValueOperator],
-        value: ValueOperator | None,
-        action_count: int | None,
+        self, policy_head: ProbabilisticActor, critics: list[ValueOperator], action_count: int | None
     ) -> None:
         super().__init__(policy_head)
-        self.critics, self.value, self.action_count = nn.ModuleList(critics), value, action_count
+        self.critics, self.action_count = nn.ModuleList(critics), action_count
 
     @property
     def in_keys(self) -> list[str]:
@@ -76,11 +71,8 @@ def build_soft_actor_critic(
     observed: ObservationShape,
     action_count: int | None,
     generator: torch.Generator | None,
-    value_network: bool,
 ) -> SoftActorCritic:
     """Build the networks with weights drawn from `generator`; arguments and errors as of `build_actor_critic`.
-
-    With `value_network` there is a network for the value of a state, too.
 
     A network of the user's own is the policy; its critics are perceptrons that see features.
     """
@@ -106,23 +98,23 @@ def build_soft_actor_critic(
     else:
         policy = actor(policy_keys, layers, Categorical)
 
-    def critic(outputs: int, actions: int, key: str) -> ValueOperator:
+    values = action_count or 1
+    value_key = "state_action_value" if continuous else "action_value"
+
+    def critic() -> ValueOperator:
         if isinstance(network, CNNConfig) and network.critic == "pictures":
-            keys, net = list(observed.seen), _layers(network, observed, outputs, actions)
+            keys, net = list(observed.seen), _layers(network, observed, values, actions)
         else:
             hidden = CRITIC_HIDDEN if isinstance(network, CNNConfig | OwnClass) else network.hidden
             activation = "relu" if isinstance(network, OwnClass) else network.activation
-            keys, net = ["observation"], dense(observed.features + actions, hidden, activation, outputs)
+            keys, net = ["observation"], dense(observed.features + actions, hidden, activation, values)
         return ValueOperator(
             initialize(net, VALUE_GAIN, generator),
             in_keys=[*keys, *["action"] * (actions > 0)],
-            out_keys=[key],
+            out_keys=[value_key],
         )
 
-    value_key = "state_action_value" if continuous else "action_value"
-    critics = [critic(action_count or 1, actions, value_key) for _ in range(2)]
-    value = critic(1, 0, "state_value") if value_network else None
-    return SoftActorCritic(policy, critics, value, action_count)
+    return SoftActorCritic(policy, [critic(), critic()], action_count)
 
 
 def _layers(network: NetworkConfig, observed: ObservationShape, outputs: int, actions: int = 0) -> nn.Module:

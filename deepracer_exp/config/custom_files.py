@@ -59,12 +59,14 @@ SAC_TAKEN = {
     "discount_factor": "algorithm.discount",
     "loss_type": "algorithm.loss_type",
     "sac_alpha": "algorithm.alpha",
-    "term_cond_max_episodes": "budget.iterations",
 }
 """Keys of a hyperparameters.json of SAC, and our keys for the same values."""
 
-SAC_OPTION = "sac_service"
-"""The algorithm that a file of SAC stands for."""
+SAC_DIFFERS = (
+    "SAC: sac_alpha is where the temperature begins (the service keeps it: algorithm.learn_alpha=false); iterations, "
+    "replay and gradient steps are those of algorithm=sac"
+)
+"""What a training with the service's SAC files does otherwise than the service."""
 
 FRAMES = "algorithm.frames_per_iteration"
 """Our alternative length of an iteration; null where the file's number of episodes is used."""
@@ -77,7 +79,8 @@ NOT_APPLICABLE = {
     "sac_alpha": "for SAC only",
     "num_epochs": "for PPO only",
     "beta_entropy": "for PPO only; SAC's is sac_alpha",
-    "num_episodes_between_training": "the service's SAC learns after every episode, too",
+    "num_episodes_between_training": "for PPO only; the service's SAC learns after every episode",
+    "term_cond_max_episodes": "for PPO only: an iteration of the service's SAC is an episode, ours are longer",
     "sensor": "here observation=NAME chooses what the policy sees; the same sensors:",
     "neural_network": "for camera images; here use network=NAME",
     "version": f"no car of that simulation version; the oldest is car={CARS[4]}",

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from deepracer_exp.errors import BadInput
 
-from .custom_files import FRAMES, KEY, SAC_OPTION, CustomFiles
+from .custom_files import FRAMES, KEY, SAC_DIFFERS, CustomFiles
 from .job_overrides import job_overrides
 from .overrides import first_given, override_line
 
@@ -65,8 +65,9 @@ def file_overrides(files: CustomFiles, typed: Mapping[str, str]) -> FileOverride
     if files.is_sac:
         winner = first_given(typed, "algorithm")
         if winner is None:
-            lines.append(override_line("algorithm", SAC_OPTION))
-            taken.append(f"algorithm={SAC_OPTION}")
+            lines.append("algorithm=sac")
+            taken.append("algorithm=sac")
+            notes.append(SAC_DIFFERS)
         else:
             notes.append(f"training_algorithm=sac: not used, because of {winner}")
     for key, value in files.learning.items():

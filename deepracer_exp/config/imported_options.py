@@ -13,7 +13,7 @@ from deepracer_exp.aws.models.model_metadata import Action
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import read_bytes
 
-from .custom_files import FRAMES, SAC_OPTION, CustomFiles
+from .custom_files import FRAMES, CustomFiles
 from .experiment import safe_name
 from .job_overrides import job_overrides, several_of
 from .options import conf_dirs
@@ -59,7 +59,7 @@ def import_files(
             values |= {"name": name, "file": f"${{conf:'reward/{name}.py'}}"}
         elif group == "algorithm":
             keys = [target.removeprefix("algorithm.") for target in (*files.taken.values(), FRAMES)]
-            base = SAC_OPTION if files.is_sac else "ppo"
+            base = "sac" if files.is_sac else "ppo"
             values = {"defaults": [base]} | {key: values[key] for key in keys if key in values}
         texts[Path("conf", group, f"{name}.yaml")] = _option(source or files.paths[file], values)
     experiment: dict[str, Any] = {
@@ -67,7 +67,7 @@ def import_files(
         "name": name,
     }
     if files.is_sac and "algorithm" not in imported.values():
-        experiment["defaults"].append({"override /algorithm": SAC_OPTION})
+        experiment["defaults"].append({"override /algorithm": "sac"})
     job, _ = job_overrides(files.workers, typed or {})
     lines = [*([override_line("car", files.car)] if files.car else ()), *job, *more]
     left_out = several_of(job)

@@ -118,15 +118,7 @@ class SACConfig(AlgorithmConfig):
     learn_alpha: bool
     target_entropy: Annotated[float, Field(ge=-100, le=1.4, allow_inf_nan=False)]
     target_entropy_share: Fraction
-    tau: Annotated[float, Field(gt=0, le=1)] | None
-    value_network: bool
-
-    def __post_init__(self) -> None:
-        """Refuse a minibatch that two critics cannot divide."""
-        if self.value_network and self.batch_size % 2:
-            raise ValueError(
-                f"batch_size={self.batch_size}: with value_network=true each critic learns from a half; accepted: even"
-            )
+    tau: Annotated[float, Field(gt=0, le=1)]
 
 
 def of_ppo_alone() -> list[str]:

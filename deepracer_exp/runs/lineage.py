@@ -69,9 +69,7 @@ def refuse_other_networks(parent: Experiment, clone: Experiment) -> None:
         )
         raise BadInput("network", f"cannot be changed in a clone: {changed}; {why}")
     kinds = [
-        "PPO"
-        if isinstance(algorithm, PPOConfig)
-        else "SAC" + " with a value network" * algorithm.value_network
+        "PPO" if isinstance(algorithm, PPOConfig) else "SAC"
         for algorithm in (parent.algorithm, clone.algorithm)
     ]
     if kinds[0] != kinds[1]:

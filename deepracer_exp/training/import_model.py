@@ -23,6 +23,7 @@ from deepracer_exp.config.compose import Composition, compose_experiment, compos
 from deepracer_exp.config.custom_files import (
     KEY,
     PLACES,
+    SAC_DIFFERS,
     CustomFiles,
     network_overrides,
     read_custom_files,
@@ -176,6 +177,7 @@ def _remarks(files: CustomFiles, model: StoredModel, absent: Sequence[str]) -> l
             "of SAC the policy is used: the service's critics see actions in degrees and m/s, so that ours start "
             "fresh, and a clone has to learn them first"
         )
+        notes.append(SAC_DIFFERS)
     elif VALUE in absent:
         notes.append(
             "a frozen graph holds only the policy: the value network starts fresh, and a clone has to learn it first"

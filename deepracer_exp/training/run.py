@@ -20,7 +20,7 @@ from deepracer_exp.agents.actor_critic import PolicyNetworks
 from deepracer_exp.config import acting
 from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.config.learning import PPOConfig, SACConfig
+from deepracer_exp.config.learning import PPOConfig
 from deepracer_exp.config.own_class import own_classes
 from deepracer_exp.config.parse import parse_config
 from deepracer_exp.config.running import BudgetConfig
@@ -154,13 +154,6 @@ def try_out(plan: TrainPlan) -> RaceSetup:
 
 def _try(experiment: Experiment, setup: RaceSetup) -> None:
     """Run the reward function's module once, let the car stand, and look for the device."""
-    algorithm = experiment.algorithm
-    if isinstance(algorithm, SACConfig) and algorithm.value_network and setup.actions.n is not None:
-        raise BadInput(
-            "algorithm.value_network=true",
-            f"the service's SAC has no list of {count(setup.actions.n, 'action')}",
-            "action_space=continuous, or algorithm=sac, which also learns a list",
-        )
     RewardFunction(setup.reward, 1, setup.reward_time_limit_s, None)
     with reading(f"car {experiment.car.name}", "dimensions, masses and settings of a car that can stand"):
         CarBatch(setup.car, 1, 1)

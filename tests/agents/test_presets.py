@@ -49,8 +49,7 @@ def test_every_schedule_keeps_a_positive_rate_over_a_run(name):
 def test_every_algorithm_builds_and_names_one_length_of_an_iteration(name):
     config = compose_option("algorithm", name, OneAlgorithm)
     network = compose_option("network", "mlp_small", MLPConfig)
-    actions = None if getattr(config, "value_network", False) else 7
-    networks = build_networks(network, config, ObservationShape(11), actions, torch.Generator())
+    networks = build_networks(network, config, ObservationShape(11), 7, torch.Generator())
     agent = build_agent(networks, config, compose_option("lr_schedule", "constant", LRScheduleConfig), seed=0)
     assert isinstance(agent, PPO if isinstance(config, PPOConfig) else SAC)
     assert (config.frames_per_iteration is None) != (config.episodes_per_iteration is None)

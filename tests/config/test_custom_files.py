@@ -159,15 +159,15 @@ SAC_FILE = {"batch_size": 32, "lr": 2e-4, "discount_factor": 0.98, "loss_type": 
 
 
 @pytest.mark.parametrize("metadata", [CONTINUOUS | {"training_algorithm": "sac"}, None])
-def test_files_of_sac_train_with_the_services_sac_and_name_what_has_no_effect(custom_files, metadata):
+def test_files_of_sac_train_with_sac_and_name_what_has_no_effect_or_differs(custom_files, metadata):
     found = overrides_of(folder := custom_files(SAC_FILE, metadata))
     algorithm = compose_experiment([f"custom_files={folder}"])[0].algorithm
     assert isinstance(algorithm, SACConfig)
-    assert (algorithm.alpha, algorithm.learn_alpha, algorithm.tau) == (0.35, False, None)
+    assert algorithm.alpha == 0.35
     assert (algorithm.lr, algorithm.batch_size, algorithm.discount) == (2e-4, 32, 0.98)
-    assert (algorithm.episodes_per_iteration, algorithm.frames_per_iteration) == (1, None)
     notes = " ".join(found.notes)
-    assert "algorithm=sac_service" in notes
+    assert "used as algorithm=sac, algorithm.lr=0.0002" in notes
+    assert "algorithm.learn_alpha=false" in notes
     assert "num_episodes_between_training=20: not applicable" in notes
     assert "exploration_type" not in notes
     assert "sac_alpha=0.35: not applicable" not in notes

@@ -41,13 +41,8 @@ def test_what_is_exported_trains_the_same_when_it_comes_back(tmp_path, space):
     assert notes == []
 
 
-def test_files_of_sac_come_back_as_the_services_sac_with_the_same_hyperparameters(tmp_path):
-    overrides = (
-        "algorithm=sac_service",
-        "action_space=continuous",
-        "algorithm.alpha=0.3",
-        "algorithm.lr=2e-4",
-    )
+def test_files_of_sac_come_back_as_sac_with_the_same_hyperparameters(tmp_path):
+    overrides = ("algorithm=sac", "action_space=continuous", "algorithm.alpha=0.3", "algorithm.lr=2e-4")
     texts, notes = files(*overrides)
     write_files(texts, tmp_path / "aws")
     back, _ = compose_experiment([f"custom_files={tmp_path / 'aws'}"])

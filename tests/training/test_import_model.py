@@ -145,21 +145,23 @@ def services_sac(networks):
 
 @pytest.fixture(scope="module")
 def soft():
-    lines = ["observation=camera", "network=deep", "network.hidden=[256,128,256]", "algorithm=sac_service"]
+    lines = ["observation=camera", "network=deep", "network.hidden=[256,128,256]", "algorithm=sac"]
     experiment, _ = compose_experiment(lines)
     shape = observation_shape(experiment.observation)
     generator = torch.Generator().manual_seed(1)
     return build_networks(experiment.network, experiment.algorithm, shape, None, generator)
 
 
-def test_a_model_of_sac_becomes_a_run_of_the_services_sac_with_its_policy(call, tmp_path, soft):
+def test_a_model_of_sac_becomes_a_run_of_sac_with_its_policy(call, tmp_path, soft):
     write_folder(tmp_path / "sent", files_of(services_sac(soft)) | SAC_FILES)
     ended = call("import", "sent", "--name", "mine", "tracking=off")
     assert ended.code == 0, ended.stderr
-    assert "fresh, and a clone" in " ".join(ended.stderr.split())
+    said = " ".join(ended.stderr.split())
+    assert "fresh, and a clone" in said
+    assert "algorithm.learn_alpha=false" in said
     run = StoredRun(ended.folder)
     algorithm = run.experiment.algorithm
-    assert (algorithm.alpha, algorithm.learn_alpha, algorithm.batch_size) == (0.4, False, 32)
+    assert (algorithm.alpha, algorithm.batch_size) == (0.4, 32)
     found = read_checkpoint(run.experiment, run.checkpoints, "best").networks
     for name, value in soft.policy_head.state_dict().items():
         assert torch.equal(value, found.policy_head.state_dict()[name])

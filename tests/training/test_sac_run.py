@@ -1,11 +1,10 @@
-"""`algorithm=sac` and `sac_service` as ordinary runs: resumed bit for bit, cloned, and refused in one line."""
+"""`algorithm=sac` as an ordinary run: resumed bit for bit, cloned, and refused in one line."""
 
 import json
 import shutil
 
 import numpy as np
 import pytest
-import yaml
 
 from deepracer_exp.runs.files import read_config, read_metrics, read_object
 from tests.conftest import IN_PROCESS
@@ -20,10 +19,6 @@ SAC = (
         "evaluation.time_s=4",
         "episode.max_steps=40",
     ),
-)
-SERVICE = (
-    *(SAC[0], "algorithm=sac_service", "algorithm.batch_size=32", "algorithm.steps_per_gradient_step=32"),
-    *("algorithm.frames_per_iteration=null", *SAC[5:]),
 )
 SMALL = "algorithm.replay_steps=700"
 """Fewer steps than are driven before and after the interruption: the oldest are replaced."""
@@ -44,9 +39,8 @@ def parts(run) -> list[str]:
         (*SAC, SMALL, "randomization=sim2real"),
         (*SAC, "action_space=discrete"),
         (*SAC, SMALL, "observation=camera_small", "network.hidden=[16]"),
-        SERVICE,
     ],
-    ids=["continuous", "full", "list", "camera", "service"],
+    ids=["continuous", "full", "list", "camera"],
 )
 def test_a_run_that_continues_is_the_run_that_was_never_interrupted(trained, copied, call, overrides):
     whole = trained(*overrides, *budget(6))
@@ -127,11 +121,6 @@ def test_a_clone_begins_with_policy_and_critics_and_an_empty_replay(copied, call
         (("lr_schedule=adaptive_kl",), ("lr_schedule=adaptive_kl", "linear")),
         (("network=mlp_small_shared",), ("network.shared_trunk=true", "accepted: false")),
         (("algorithm.tau=0",), ("algorithm.tau=0",)),
-        (("algorithm.batch_size=511", "algorithm.value_network=true"), ("batch_size=511", "even")),
-        (
-            (*SERVICE, "action_space=discrete"),
-            ("value_network=true", "action_space=continuous"),
-        ),
         (("algorithm.replay_steps=10",), ("replay_steps=10", "accepted")),
         (
             ("observation=camera_small", "algorithm.replay_mb=1", "collector.cars=256"),
@@ -153,15 +142,3 @@ def test_a_clone_keeps_the_algorithm_whose_networks_it_begins_with(copied, call)
 
 def test_keys_of_sac_are_refused_with_ppo(call):
     call("train", *IN_PROCESS, "algorithm.alpha=0.1").assert_bad_input("algorithm.alpha", "no such key")
-
-
-def test_the_composed_options_name_what_differs_from_the_service(call):
-    ours, services = (
-        yaml.safe_load(call("train", f"algorithm={name}", "--cfg").stdout)["algorithm"]
-        for name in ("sac", "sac_service")
-    )
-    assert ours.keys() == services.keys()
-    assert services | {} == services
-    assert (services["alpha"], services["learn_alpha"], services["tau"], services["value_network"]) == (
-        *(0.2, False, None, True),
-    )
