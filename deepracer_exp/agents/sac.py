@@ -16,7 +16,6 @@ from deepracer_exp.errors import RunFailed
 from .actor_critic import PolicyNetworks
 from .algorithm import Algorithm, UpdateMetrics, require_finite
 from .replay import Replay
-from .sac_losses import SACLosses
 from .schedules import Schedule
 from .soft_actor_critic import SoftActorCritic
 
@@ -77,10 +76,6 @@ class SAC(Algorithm):
         self._learner = networks if device == _CPU else copy.deepcopy(networks).to(device)
         self._loss = self._build_loss()
         self._loss.make_value_estimator(gamma=config.discount)
-        fits = SACLosses.fits(self._learner)
-        self._losses: SACLosses | SACLoss | DiscreteSACLoss = (
-            SACLosses(self._learner, self._loss, config) if fits else self._loss
-        )
         self._targets = SoftUpdate(self._loss, eps=1 - config.tau)
         self._parameters = [weight for weight in self._loss.parameters() if weight.requires_grad]
         self._optimizer = torch.optim.Adam(self._parameters, lr=config.lr, eps=1e-5, fused=True)
@@ -186,7 +181,7 @@ class SAC(Algorithm):
         """Make a gradient step and return the parts of SACMetrics."""
         # A replay that is still smaller than a minibatch gives as many as the largest power of two in it.
         size = min(self.config.batch_size, 1 << (len(self.replay).bit_length() - 1))
-        losses = self._losses(self.replay.sample(size).to(self._device))
+        losses = self._loss(self.replay.sample(size).to(self._device))
         names = [name for name in _LOSSES if name != "loss_alpha" or self.config.learn_alpha]
         loss = torch.stack([losses[name] for name in names]).sum()
         self._optimizer.zero_grad()
@@ -206,7 +201,7 @@ class SAC(Algorithm):
             [losses["loss_actor"].detach(), losses["loss_qvalue"].detach(), entropy, q_value, grad_norm]
         )
 
-    def _fail(self, losses: TensorDictBase | dict[str, Tensor], names: list[str]) -> NoReturn:
+    def _fail(self, losses: TensorDictBase, names: list[str]) -> NoReturn:
         """Raise RunFailed with the first thing that is not finite."""
         for name in names:
             if not torch.isfinite(losses[name]):
