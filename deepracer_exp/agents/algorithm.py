@@ -41,7 +41,7 @@ class Algorithm:
     """Improves networks from batches of its own driving; base class of your own algorithms.
 
     Attributes:
-        replay: Past steps that it learns from again, kept in the run folder; None: it needs none.
+        replay: Past steps that it learns from again, saved with the last checkpoint; None: it needs none.
         threads: That an update of networks of features may use.
     """
 

@@ -79,7 +79,7 @@ class SAC(Algorithm):
         self._targets = SoftUpdate(self._loss, eps=1 - config.tau)
         self._parameters = [weight for weight in self._loss.parameters() if weight.requires_grad]
         self._optimizer = torch.optim.Adam(self._parameters, lr=config.lr, eps=1e-5, fused=True)
-        self._owed_steps = 0.0
+        self._collected_steps, self._owed_steps = 0, 0.0
 
     def update(self, batch: TensorDictBase, iteration: int, fraction: float) -> SACMetrics:
         """Add the batch to the replay and learn from it, see `Algorithm.update`."""
@@ -88,6 +88,7 @@ class SAC(Algorithm):
         for group in self._optimizer.param_groups:
             group["lr"] = lr
         self.replay.extend(batch)
+        self._collected_steps += batch.numel()
         steps = self._steps_due(batch.numel())
         seed = int(torch.randint(2**62, (), generator=self._generator))
         devices = [] if self._device == _CPU else [self._device]
@@ -112,7 +113,7 @@ class SAC(Algorithm):
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything but the steps of the replay: tensors on the CPU and plain values only."""
+        """Return everything but the replay, which has its own: tensors on the CPU and plain values only."""
         optimizer = self._optimizer.state_dict()
         moments = {
             index: {key: value.cpu() for key, value in state.items()}
@@ -123,12 +124,12 @@ class SAC(Algorithm):
             "optimizer": {**optimizer, "state": moments},
             "generator": self._generator.get_state(),
             "loss": loss,
+            "collected_steps": self._collected_steps,
             "owed_steps": self._owed_steps,
-            "replay": self.replay.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a `state_dict`; with the steps of the replay, further updates equal the original's bit for bit."""
+        """Restore a `state_dict`; with that of the replay, further updates equal the original's bit for bit."""
         super().load_state_dict(state)
         self._take_networks()
         self._optimizer.load_state_dict(state["optimizer"])
@@ -136,8 +137,7 @@ class SAC(Algorithm):
         with torch.no_grad():
             for name, value in self._own_of_loss().items():
                 value.copy_(state["loss"][name])
-        self._owed_steps = state["owed_steps"]
-        self.replay.load_state_dict(state["replay"])
+        self._collected_steps, self._owed_steps = state["collected_steps"], state["owed_steps"]
 
     def begin_with(self, networks: PolicyNetworks) -> None:
         """Start from the networks of another run, with an empty replay; the targets are copies of its critics."""
@@ -170,7 +170,7 @@ class SAC(Algorithm):
 
     def _steps_due(self, collected: int) -> int:
         """Return how many gradient steps follow a batch."""
-        if self.replay.arrived_steps < self.config.warmup_steps or not len(self.replay):
+        if self._collected_steps < self.config.warmup_steps:
             return 0
         self._owed_steps += collected / self.config.steps_per_gradient_step
         due = int(self._owed_steps)
@@ -179,9 +179,7 @@ class SAC(Algorithm):
 
     def _gradient_step(self) -> Tensor:
         """Make a gradient step and return the parts of SACMetrics."""
-        # A replay that is still smaller than a minibatch gives as many as the largest power of two in it.
-        size = min(self.config.batch_size, 1 << (len(self.replay).bit_length() - 1))
-        losses = self._loss(self.replay.sample(size).to(self._device))
+        losses = self._loss(self.replay.sample(self.config.batch_size).to(self._device))
         names = [name for name in _LOSSES if name != "loss_alpha" or self.config.learn_alpha]
         loss = torch.stack([losses[name] for name in names]).sum()
         self._optimizer.zero_grad()

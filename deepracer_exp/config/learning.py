@@ -113,7 +113,7 @@ class SACConfig(AlgorithmConfig):
     steps_per_gradient_step: Annotated[float, Field(ge=0.01, le=10**6, allow_inf_nan=False)]
     warmup_steps: Annotated[int, Field(ge=0, le=10**7)]
     replay_steps: Annotated[int, Field(ge=1, le=10**8)]
-    replay_mb: Annotated[int, Field(ge=1, le=10**6)]
+    replay_mb: Annotated[int, Field(ge=1, le=4000)]  # a checkpoint is read up to 4 GiB
     alpha: Positive
     learn_alpha: bool
     target_entropy: Annotated[float, Field(ge=-100, le=1.4, allow_inf_nan=False)]

@@ -21,13 +21,13 @@ from deepracer_exp.errors import BadInput, RunFailed
 
 from .checkpoint_files import find_checkpoint, kept_checkpoints, pinned, restore_links, write_hashes
 from .components import State, check_folder, load_component, one_line
-from .files import CHECKPOINTS
-from .replay_parts import ReplayParts
+from .files import CHECKPOINTS, REPLAY
 
 logger = logging.getLogger("deepracer_exp")
 
 AGENT, TRAINING = "agent", "training"
 """Components: the networks with what improves them, and what a resumed training needs besides."""
+_NO_RESUME = "a training cannot resume from it"
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,12 +119,23 @@ def read_policy(experiment: Experiment, path: Path) -> StoredPolicy:
 
 
 def read_agent(path: Path, agent: Algorithm) -> None:
-    """Give an agent the networks, optimizer and schedule of a checkpoint that `check` has accepted.
+    """Give an agent the networks, optimizer, schedule and replay of a checkpoint that `check` has accepted.
 
     Raises:
-        BadInput: it does not fit.
+        BadInput: it does not fit, or its replay is missing or corrupt.
     """
     load_component(path, AGENT, agent, "cannot be used")
+    if agent.replay is None:
+        return
+    replay = path.parent.parent / REPLAY / path.name
+    if not replay.is_dir():
+        raise BadInput(
+            replay,
+            "the replay of this checkpoint is not there; restore it, or start a new run from the checkpoint with "
+            "`deepracer-exp clone`",
+        )
+    check_folder(replay, (REPLAY,), (REPLAY,))
+    load_component(replay, REPLAY, agent.replay, _NO_RESUME)
 
 
 def read_training(path: Path) -> dict[str, Any]:
@@ -136,7 +147,7 @@ def read_training(path: Path) -> dict[str, Any]:
         BadInput: there is none, or it cannot be read.
     """
     state = State({})
-    load_component(path, TRAINING, state, "a training cannot resume from it")
+    load_component(path, TRAINING, state, _NO_RESUME)
     return dict(state.values)
 
 
@@ -146,6 +157,9 @@ class CheckpointStore:
     A directory is written aside with the hashes of its files and moved into place whole (torchrl.checkpoint: tensors
     and JSON, no pickle); a link changes in one step, and what is older is removed after that. So whenever the run is
     killed, all names lead to a complete checkpoint.
+
+    The replay of an agent that has one is kept of `last` alone, because it is large: in `replay/` of the run folder,
+    under the checkpoint's name, written in the same way before the checkpoint.
     """
 
     def __init__(self, run_dir: Path, keep: int, every: int | None = None):
@@ -162,8 +176,8 @@ class CheckpointStore:
         self.folder = run_dir / CHECKPOINTS
         self.folder.mkdir(exist_ok=True)
         self._keep, self._every = keep, every or 1
-        self._replay = ReplayParts(run_dir)
-        for path in self.folder.glob(".*"):
+        self._replays = run_dir / REPLAY
+        for path in (*self.folder.glob(".*"), *self._replays.glob(".*")):
             _remove(path)
         restore_links(self.folder)
         pinned(self.folder)
@@ -187,26 +201,17 @@ class CheckpointStore:
             OSError, RunFailed: the folder cannot be written; what was there before is unchanged.
         """
         name = checkpoint_name(counters["iteration"])
-        replay = None if training is None else agent.replay
-        if replay is not None:
-            self._replay.write(replay)
-        if not (self.folder / name).exists():  # nothing is learned between two updates
-            self._write(name, agent, counters, training)
+        components: dict[str, Any] = {AGENT: agent}
+        if training is not None:
+            components[TRAINING] = State(training)
+            if agent.replay is not None:
+                _write(self._replays / name, {REPLAY: agent.replay}, counters)
+        _write(self.folder / name, components, counters)
         self.mark(counters["iteration"], best=best, fastest=fastest)
         if training is not None:
             self._link("last", name)
+            self._drop_replays(name)
         self._prune()
-        if replay is not None:
-            self._replay.drop(replay)
-
-    def restore_replay(self, agent: Algorithm) -> None:
-        """Give an agent whose state was read the steps of its replay, and remove those that came later.
-
-        Raises:
-            BadInput: some are missing or corrupt.
-        """
-        if agent.replay is not None:
-            self._replay.restore(agent.replay)
 
     def mark(self, iteration: int, *, best: bool = False, fastest: bool = False) -> None:
         """Let `best` and `fastest` lead to an iteration's checkpoint, if it is.
@@ -232,25 +237,13 @@ class CheckpointStore:
                 self._link(label, checkpoint_name(number))
             else:
                 (self.folder / label).unlink(missing_ok=True)
+        self._drop_replays(checkpoint_name(iteration))
 
-    def _write(
-        self, name: str, agent: Algorithm, counters: Mapping[str, Any], training: Mapping[str, Any] | None
-    ) -> None:
-        # Memory-mapped tensors, the default, would end the process by SIGBUS on a full disk.
-        archive = StateDictCheckpointAdapter("archive")
-        checkpoint = Checkpoint().register(AGENT, agent, adapter=archive)
-        if training is not None:
-            checkpoint.register(TRAINING, State(training), adapter=archive)
-        aside = self.folder / f".{name}"
-        try:
-            checkpoint.save(aside, metadata=dict(counters))
-            write_hashes(aside)
-            aside.rename(self.folder / name)
-        except (RuntimeError, OSError) as error:  # RuntimeError: torch's, for a full disk
-            with contextlib.suppress(OSError):
-                _remove(aside)
-            reason = str(error).splitlines()[0]
-            raise RunFailed(f"{self.folder / name}: the checkpoint cannot be written: {reason}") from error
+    def _drop_replays(self, last: str) -> None:
+        """Remove all replays but that of a checkpoint."""
+        for path in self._replays.glob("*"):
+            if path.name != last:
+                _remove(path)
 
     def _link(self, label: str, name: str) -> None:
         aside = self.folder / f".{label}"
@@ -272,6 +265,27 @@ class CheckpointStore:
         """Return the checkpoints, the oldest first."""
         folders = (path for path in self.folder.iterdir() if path.name.isdigit() and path.is_dir())
         return sorted(folders, key=lambda path: int(path.name))
+
+
+def _write(path: Path, components: Mapping[str, Any], counters: Mapping[str, Any]) -> None:
+    """Write a folder of components, unless it is there: nothing is learned between two updates."""
+    if path.exists():
+        return
+    checkpoint = Checkpoint()
+    for name, component in components.items():
+        # Memory-mapped tensors, the default, would end the process by SIGBUS on a full disk.
+        checkpoint.register(name, component, adapter=StateDictCheckpointAdapter("archive"))
+    aside = path.with_name(f".{path.name}")
+    try:
+        path.parent.mkdir(exist_ok=True)
+        checkpoint.save(aside, metadata=dict(counters))
+        write_hashes(aside)
+        aside.rename(path)
+    except (RuntimeError, OSError) as error:  # RuntimeError: torch's, for a full disk
+        with contextlib.suppress(OSError):
+            _remove(aside)
+        reason = str(error).splitlines()[0]
+        raise RunFailed(f"{path}: the checkpoint cannot be written: {reason}") from error
 
 
 def checkpoint_name(iteration: int) -> str:

@@ -54,21 +54,14 @@ def _replay(experiment: Experiment) -> str | None:
         return None
     observed = observation_shape(experiment.observation)
     picture = math.prod(observed.picture or (0,))
-    bytes_per_step = 4 * (observed.features + (observed.lidar or 0)) + picture + _OTHER_BYTES
+    # What is seen before and after the step.
+    bytes_per_step = 2 * (4 * (observed.features + (observed.lidar or 0)) + picture) + _OTHER_BYTES
     steps = min(algorithm.replay_steps, algorithm.replay_mb * 10**6 // bytes_per_step)
-    cars = experiment.collector.cars
-    if algorithm.replay_steps < 2 * cars:
+    if steps < algorithm.batch_size:
         raise BadInput(
-            f"algorithm.replay_steps={algorithm.replay_steps}",
-            f"{cars:,} cars need two steps each",
-            f"at least {2 * cars}",
-        )
-    if steps < 2 * cars:
-        needed = -(-2 * cars * bytes_per_step // 10**6)
-        raise BadInput(
-            f"algorithm.replay_mb={algorithm.replay_mb}",
-            f"holds {steps:,} steps, and {cars:,} cars need two each",
-            f"at least {needed}",
+            f"algorithm.replay_steps={algorithm.replay_steps}, algorithm.replay_mb={algorithm.replay_mb}",
+            f"the replay holds {steps:,} steps",
+            f"at least a minibatch of {algorithm.batch_size:,}",
         )
     needed, free = steps * bytes_per_step, psutil.virtual_memory().available
     if needed > free:

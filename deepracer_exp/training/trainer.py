@@ -284,7 +284,6 @@ class Trainer:
             BadInput: it does not fit the experiment.
         """
         read_agent(checkpoint, self.agent)
-        self.checkpoints.restore_replay(self.agent)
         self.iteration, self.env_steps = state["iteration"], state["env_steps"]
         self.saved_steps = self.env_steps
         self.metrics.load_state_dict(state["results"])

@@ -1,3 +1,4 @@
+import copy
 import dataclasses
 import math
 
@@ -71,17 +72,10 @@ def test_it_learns_to_take_the_action_that_is_rewarded(actions):
 def test_a_restored_agent_continues_bit_for_bit(actions):
     networks, sac = make(actions)
     train(networks, sac, 3)
-    state, parts = sac.state_dict(), sac.replay.parts(0)
-    state = {key: value.copy() if isinstance(value, dict) else value for key, value in state.items()}
-    state["networks"] = {key: value.clone() for key, value in state["networks"].items()}
-    parts = [(begin, rows.clone()) for begin, rows in parts]
-    moments = state["optimizer"]["state"]
-    state["optimizer"] = state["optimizer"] | {
-        "state": {i: {key: value.clone() for key, value in one.items()} for i, one in moments.items()}
-    }
+    state, steps = copy.deepcopy((sac.state_dict(), sac.replay.state_dict()))
     others, resumed = make(actions, seed=9)
     resumed.load_state_dict(state)
-    resumed.replay.restore(parts)
+    resumed.replay.load_state_dict(steps)
     for one, algorithm in ((networks, sac), (others, resumed)):
         train(one, algorithm, 3, start=3)
     assert torch.equal(parameters(networks), parameters(others))

@@ -94,9 +94,9 @@ def test_traces_of_failed_runs_can_go_and_of_no_others(season):
 
 def test_replays_of_ended_runs_are_offered_and_no_others(season):
     for name, status in (("1", "finished"), ("2", "failed"), ("3", "interrupted"), ("4", None)):
-        part = season.run(name, status=status) / "replay" / "000000000000-000000000008"
+        part = season.run(name, status=status) / "replay" / "000020"
         part.mkdir(parents=True)
-        (part / "steps.tdz").write_bytes(bytes(5000))
+        (part / "state.tdz").write_bytes(bytes(5000))
         age(part.parent.parent, 2 * HOUR_S)
     found = surveyed(season, False)
     offered = replays(found.offered)
