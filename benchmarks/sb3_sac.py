@@ -87,7 +87,6 @@ def build(experiment: Experiment, watch: Watch) -> SAC:
     assert isinstance(algorithm, SACConfig)
     assert isinstance(network, MLPConfig)
     assert algorithm.frames_per_iteration is not None
-    assert algorithm.tau is not None
     n_cars = experiment.collector.cars
     periods = -(-algorithm.frames_per_iteration // n_cars)
     schedule = build_schedule(experiment.lr_schedule)

@@ -76,7 +76,7 @@ class SAC(Algorithm):
         self._learner = networks if device == _CPU else copy.deepcopy(networks).to(device)
         self._loss = self._build_loss()
         self._loss.make_value_estimator(gamma=config.discount)
-        self._targets = SoftUpdate(self._loss, eps=1 - config.tau)
+        self._targets = SoftUpdate(self._loss, tau=config.tau)
         self._parameters = [weight for weight in self._loss.parameters() if weight.requires_grad]
         self._optimizer = torch.optim.Adam(self._parameters, lr=config.lr, eps=1e-5, fused=True)
         self._collected_steps, self._owed_steps = 0, 0.0
