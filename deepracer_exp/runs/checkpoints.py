@@ -158,8 +158,8 @@ class CheckpointStore:
     and JSON, no pickle); a link changes in one step, and what is older is removed after that. So whenever the run is
     killed, all names lead to a complete checkpoint.
 
-    The replay of an agent that has one is kept of `last` alone, because it is large: in `replay/` of the run folder,
-    under the checkpoint's name, written in the same way before the checkpoint.
+    The replay of an agent that has one is large, and kept of `last` and of the checkpoint before it alone: in `replay/`
+    of the run folder, under the checkpoint's name, written in the same way before the checkpoint.
     """
 
     def __init__(self, run_dir: Path, keep: int, every: int | None = None):
@@ -210,8 +210,9 @@ class CheckpointStore:
         self.mark(counters["iteration"], best=best, fastest=fastest)
         if training is not None:
             self._link("last", name)
-            self._drop_replays(name)
         self._prune()
+        if training is not None:
+            self._drop_replays(name)
 
     def mark(self, iteration: int, *, best: bool = False, fastest: bool = False) -> None:
         """Let `best` and `fastest` lead to an iteration's checkpoint, if it is.
@@ -240,9 +241,10 @@ class CheckpointStore:
         self._drop_replays(checkpoint_name(iteration))
 
     def _drop_replays(self, last: str) -> None:
-        """Remove all replays but that of a checkpoint."""
+        """Remove all replays but that of the checkpoint `last` and that of the one which a corrupt `last` leads to."""
+        kept = [path.name for path in self._numbered() if path.name <= last][-2:]
         for path in self._replays.glob("*"):
-            if path.name != last:
+            if path.name not in kept:
                 _remove(path)
 
     def _link(self, label: str, name: str) -> None:
