@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.process import BaseProcess
-from types import FrameType, TracebackType
+from types import CodeType, FrameType, TracebackType
 from typing import Any, Self
 
 _WAIT_FACTOR = 10
@@ -27,6 +27,11 @@ _REFUSED: tuple[tuple[Any, str], ...] = (
     *((owner, "start") for owner in (threading.Thread, BaseProcess)),
 )
 """Functions that guarded code must not call, as owner and name."""
+
+
+def run_module(code: CodeType, namespace: dict[str, Any]) -> None:
+    """Run the compiled module of a reward function in a namespace; only here a text is executed as a program."""
+    exec(code, namespace)
 
 
 class Misconduct(BaseException):

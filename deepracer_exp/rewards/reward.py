@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from deepracer_exp.errors import BadInput, RunFailed
 
-from .guard import CtrlC, DeadlinePassed, Guard, Misconduct
+from .guard import CtrlC, DeadlinePassed, Guard, Misconduct, run_module
 from .params import TrackParams, batch_params, row_keys, rows, scalar_params, select
 from .prints import RewardPrints
 from .source import RewardSource, source_with_constants
@@ -45,11 +45,6 @@ class RewardFailed(RunFailed):
         """The params of the call (`reward_batch`: of all cars, if the car is not known)."""
         self.car = car
         """Index of the car in its batch; None: not known."""
-
-
-def run_module(code: CodeType, namespace: dict[str, Any]) -> None:
-    """Run the compiled module of a reward function in a namespace; only here a text is executed as a program."""
-    exec(code, namespace)
 
 
 class RewardFunction:

@@ -1,188 +1,82 @@
 """Call a reward function as deepracer-on-aws' validator does, and say what the validator would refuse."""
 
-import builtins
-import dis
-import inspect
+import json
 import math
-import reprlib
+import signal
+import subprocess
 import sys
-from collections.abc import Callable
-from types import FrameType
 from typing import Any
 
 import numpy as np
 
-from deepracer_exp.rewards.guard import CtrlC, DeadlinePassed, Guard
-from deepracer_exp.rewards.reward import MAX_REWARD, Unusable, run_module, what_happened
+from deepracer_exp.rewards.reward import MAX_REWARD
 from deepracer_exp.rewards.source import RewardSource, source_with_constants
 from deepracer_exp.tracks.track import Track
 
-from .aws_rules import AwsFinding
-from .probe import Coverage
+from .aws_rules import AwsFinding, late_imports
 
+_MODULE = "deepracer_exp.validation.aws_calls"
 _LIMIT_S = 5.0
+"""CPU seconds of a call."""
+_LONGEST_S = 120.0
+"""Seconds until a function is given up that waits without computing."""
 _OBJECTS = 6
-_IMPORT_NAME = dis.opmap["IMPORT_NAME"]
-_METHODS = "numpy._core._methods"
-_ARRAY_METHODS = (
-    "methods of arrays, such as x.sum(), x.max(), x.all(), do that; functions, such as np.sum(x), do not"
-)
-
-
-class _LateImport(Exception):  # noqa: N818 - reads as what it is at the raise site
-    """An import statement was executed while the function was called."""
 
 
 def dry_run_findings(source: RewardSource, track: Track) -> list[AwsFinding]:
     """Return the reasons why the validator would refuse a function after calling it; empty if it would accept it.
 
-    The module is loaded once for all calls and, as there, run again in the same namespace before each of them: what
-    only a function has assigned (`global`) is kept.
+    The function is called in a process of its own. As there, the module is loaded once for all calls and run again in
+    the same namespace before each of them.
     """
-    module = _Module(source)
-    module.run()
-    module.check_signature()
-    if module.error is None:
-        module.find_imports(validator_params(track)["at the start"])
-        for name, params in validator_params(track).items():
-            module.call(name, params)
-    return module.findings()
+    situations = validator_params(track)
+    answers, ending = _answers(source, situations)
+    if "load" not in answers:
+        return [AwsFinding(0, f"cannot be imported: {ending}")]
+    if answers["load"] is not None:
+        return [AwsFinding(0, answers["load"])]
+    findings: list[AwsFinding] = []
+    signature = answers.get("signature")
+    if signature is not None:
+        text = f"reward_function{signature}: exactly one parameter is accepted, reward_function(params)"
+        findings.append(AwsFinding(0, text))
+    if "imports" in answers:
+        findings += late_imports(source_with_constants(source), **answers["imports"])
+    wrong: dict[str, list[str]] = {}
+    for name in situations:
+        what = answers.get(name, ending)
+        if what is not None:
+            wrong.setdefault(what, []).append(name)
+        if name not in answers:
+            break
+    return findings + [AwsFinding(0, f"{what}, called {', '.join(names)}") for what, names in wrong.items()]
 
 
-class _Module:
-    """A reward module in a namespace of its own, and what is wrong with it."""
-
-    def __init__(self, source: RewardSource) -> None:
-        self._path = source.path
-        self._code = compile(source_with_constants(source), source.path, "exec", dont_inherit=True)
-        self._namespace: dict[str, Any] = {"__name__": "reward_function", "print": _format}
-        self._found: list[AwsFinding] = []
-        self._wrong: dict[str, list[str]] = {}
-        self._hangs = False
-        self.error: str | None = None
-
-    def run(self) -> None:
-        """Run the module's text in its namespace."""
-        try:
-            with Guard(_LIMIT_S):
-                run_module(self._code, self._namespace)
-        except CtrlC:
-            raise
-        except BaseException as error:  # noqa: BLE001 - of the module's code
-            self.error = f"cannot be imported: {self._what_happened(error)}"
-
-    def check_signature(self) -> None:
-        """Find what is no function, or one that has not exactly one parameter."""
-        if self.error is not None:
-            return
-        function = self._namespace.get("reward_function")
-        if not inspect.isfunction(function):
-            self.error = f"reward_function is {reprlib.repr(function)}, no function"
-            return
-        signature = inspect.signature(function)
-        if len(signature.parameters) != 1:
-            text = f"reward_function{signature}: exactly one parameter is accepted, reward_function(params)"
-            self._found.append(AwsFinding(0, text))
-
-    def find_imports(self, params: dict[str, Any]) -> None:
-        """Find imports that are executed while the function is called; its other errors are those of `call`."""
-        self.run()
-        late: dict[str, int] = {}
-        try:
-            with Guard(_LIMIT_S):
-                _noting_imports(self._namespace["reward_function"], self._path, late)(params)
-        except CtrlC:
-            raise
-        except BaseException:  # noqa: BLE001 - of the module's code, which `call` reports
-            pass
-        for name, line in late.items():
-            why = _ARRAY_METHODS if name == _METHODS else "imports belong at the top of the file"
-            text = f"{name} is imported while the function is called; {why}"
-            self._found.append(AwsFinding(line, text, "documented" if line else "validator"))
-
-    def call(self, name: str, params: dict[str, Any]) -> None:
-        """Call the function in the situation `name`, after running the module again; not after it has hung."""
-        if self._hangs:
-            return
-        self.run()
-        try:
-            with Guard(_LIMIT_S):
-                reward = self._namespace["reward_function"](dict(params))
-                # The subclass np.float64 is one; a bool, an int or np.float32 is not.
-                if isinstance(reward, float) and -MAX_REWARD <= reward <= MAX_REWARD:
-                    return
-                returned = f"returned {reprlib.repr(reward)} of type {type(reward).__name__}"
-            line = self._line_of_return(params)
-            raise Unusable(
-                f"line {line} {returned}; accepted: a float from {-MAX_REWARD:g} to {MAX_REWARD:g}"
-            )
-        except CtrlC:
-            raise
-        except BaseException as error:  # noqa: BLE001 - of the module's code
-            self._hangs = isinstance(error, DeadlinePassed)
-            self._wrong.setdefault(self._what_happened(error), []).append(name)
-
-    def _what_happened(self, error: BaseException) -> str:
-        return what_happened(error, self._path, _LIMIT_S)[0]
-
-    def _line_of_return(self, params: dict[str, Any]) -> int | None:
-        self.run()
-        with Guard(_LIMIT_S), Coverage(self._path) as coverage:
-            self._namespace["reward_function"](dict(params))
-        return coverage.returned_at
-
-    def findings(self) -> list[AwsFinding]:
-        """Return what is wrong, each kind once with the situations in which it is."""
-        if self.error is not None:
-            return [AwsFinding(0, self.error)]
-        wrong = (f"{what}, called {', '.join(names)}" for what, names in self._wrong.items())
-        return [*self._found, *(AwsFinding(0, text) for text in wrong)]
-
-
-def _noting_imports(
-    function: Callable[..., object], path: str, late: dict[str, int]
-) -> Callable[[dict[str, Any]], object]:
-    """Return the function so that an import while it is called is noted in `late` and, if it is a statement, fails.
-
-    `late` gets names of modules and lines of the function's file `path`; 0 for a library's, which counts, too. An
-    import by code in C is only noted, because some of it crashes if it fails.
-    """
-
-    def noted(name: str, *args: Any, **options: Any) -> object:
-        caller = sys._getframe(1)
-        if caller.f_code.co_code[caller.f_lasti] == _IMPORT_NAME:
-            late[name] = caller.f_lineno if caller.f_code.co_filename == path else 0
-            raise _LateImport(name)
-        if not name.startswith("numpy."):  # in these, versions of NumPy differ
-            late[name] = 0
-        return importing(name, *args, **options)
-
-    def called(frame: FrameType, event: str, _: object) -> None:
-        # This process has imported the module already; there, the first method of an array that needs it does.
-        if event == "call" and frame.f_globals.get("__name__") == _METHODS and frame.f_back is not None:
-            caller = frame.f_back
-            by_name = "_methods" in caller.f_code.co_names or caller.f_globals is frame.f_globals
-            if not by_name:  # but by code in C, which imports it
-                late[_METHODS] = 0
-
-    importing, profile = builtins.__import__, sys.getprofile()
-
-    def call(params: dict[str, Any]) -> object:
-        builtins.__import__ = noted  # type: ignore[assignment]
-        sys.setprofile(called)
-        try:
-            return function(params)
-        finally:
-            sys.setprofile(profile)
-            builtins.__import__ = importing
-
-    return call
-
-
-def _format(*values: object, **_: object) -> None:
-    """Stand in for `print`: what is printed must be printable there, too."""
-    for value in values:
-        str(value)
+def _answers(source: RewardSource, situations: dict[str, dict[str, Any]]) -> tuple[dict[str, Any], str]:
+    """Return the result of each step of `aws_calls` that it came to, and how the process ended."""
+    asked = {
+        "path": source.path,
+        "text": source_with_constants(source),
+        "limit_s": _LIMIT_S,
+        "most": MAX_REWARD,
+        "situations": situations,
+    }
+    command = [sys.executable, "-P", "-m", _MODULE]
+    stdin = json.dumps(asked, default=np.ndarray.tolist).encode()
+    try:
+        process = subprocess.run(command, input=stdin, capture_output=True, timeout=_LONGEST_S, check=False)
+    except subprocess.TimeoutExpired as error:
+        output, ending = error.stdout or b"", f"took longer than {_LONGEST_S:g} s"
+    else:
+        output, code = process.stdout, process.returncode
+        ending = (
+            f"took longer than {_LIMIT_S:g} s of CPU"
+            if code == -signal.SIGPROF
+            else f"ended its process with code {code}"
+        )
+        if not output:
+            raise RuntimeError(f"{_MODULE} did not start: {process.stderr.decode(errors='replace')}")
+    return dict(map(json.loads, output.splitlines())), ending
 
 
 def validator_params(track: Track) -> dict[str, dict[str, Any]]:

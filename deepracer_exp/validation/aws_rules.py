@@ -3,7 +3,7 @@
 import ast
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -42,6 +42,24 @@ WORDS = (
     "memmap",
 )
 """Forbidden anywhere in the text, even as part of a longer word."""
+ARRAY_METHODS = frozenset(("all", "any", "clip", "max", "mean", "min", "prod", "std", "sum", "var"))
+"""Methods of arrays for which NumPy's C code imports a module when they are called first."""
+IMPORTING_FUNCTIONS = frozenset(
+    f"numpy.{name}"
+    for name in (
+        *("allclose", "array_equal", "array_equiv", "average", "clip", "corrcoef", "cov", "geomspace"),
+        *("histogram", "isclose", "linalg.eig", "linalg.matrix_rank", "median", "nanargmax", "nanargmin"),
+        *("nanmax", "nanmean", "nanmedian", "nanmin", "nanpercentile", "nanquantile", "nanstd", "nanvar"),
+        *("percentile", "polydiv", "polyfit", "polymul", "quantile", "roots", "trapezoid", "trim_zeros"),
+        "unique",
+    )
+) | {"scipy.optimize.lsq_linear"}
+"""Functions that call such a method or have an import statement: of NumPy 2.3, and the one of SciPy in the zoo."""
+_LATE = "is imported while the function is called; imports belong at the top of the file"
+_BY_NUMPY = (
+    "imports a module while the function is called; methods of arrays, such as x.sum(), x.max(), x.all(), do that, and "
+    "a few functions; most, such as np.sum(x), do not"
+)
 _NOT_READ = (
     "the validator reads only calls and attributes that begin with a name; give this part a name first"
 )
@@ -72,6 +90,56 @@ def _imports(tree: ast.Module) -> Iterator[AwsFinding]:
             if name.split(".")[0] not in IMPORTS:
                 text = f"import of {name}; allowed are {', '.join(IMPORTS)}"
                 yield AwsFinding(node.lineno, text, "documented")
+
+
+def late_imports(text: str, lines: Collection[int], loaded: Sequence[str]) -> list[AwsFinding]:
+    """Return the imports while a function was called that executed these lines and loaded these modules, in order.
+
+    The syntax tree has the import statements, and the calls that make NumPy import. A name of an array's method counts
+    whatever it is called on, unless the text defines a function of that name.
+    """
+    tree = ast.parse(text)
+    names = _imported_names(tree)
+    methods = ARRAY_METHODS - {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+    late: list[AwsFinding] = []
+    by_numpy: list[AwsFinding] = []
+    for node in ast.walk(tree):
+        match node:
+            case ast.Import(names=aliases) if node.lineno in lines:
+                late += (AwsFinding(node.lineno, f"{a.name} {_LATE}", "documented") for a in aliases)
+            case ast.ImportFrom(module=module) if node.lineno in lines:
+                late.append(AwsFinding(node.lineno, f"{module or '.'} {_LATE}", "documented"))
+            case ast.Call(func=function) if node.lineno in lines:
+                name = _full_name(function, names)
+                if name in IMPORTING_FUNCTIONS or (
+                    name is None and isinstance(function, ast.Attribute) and function.attr in methods
+                ):
+                    by_numpy.append(AwsFinding(node.lineno, f"{_shortened(function)} {_BY_NUMPY}"))
+    if loaded and not late:  # the last one is what was asked for, those before it are what that one imports
+        late.append(AwsFinding(0, f"{loaded[-1]} {_LATE}"))
+    return late + by_numpy
+
+
+def _imported_names(tree: ast.Module) -> dict[str, str]:
+    """Return what each imported name stands for, such as numpy for np and numpy.mean for mean."""
+    names: dict[str, str] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.asname: alias.name for alias in node.names if alias.asname}
+            names |= {
+                alias.name.split(".")[0]: alias.name.split(".")[0] for alias in node.names if not alias.asname
+            }
+        elif isinstance(node, ast.ImportFrom):
+            names |= {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def _full_name(node: ast.expr, names: Mapping[str, str]) -> str | None:
+    """Return the full name of an imported name, or of an attribute of it; None for anything else."""
+    if isinstance(node, ast.Attribute):
+        owner = _full_name(node.value, names)
+        return None if owner is None else f"{owner}.{node.attr}"
+    return names.get(node.id) if isinstance(node, ast.Name) else None
 
 
 def _calls(tree: ast.Module) -> Iterator[AwsFinding]:

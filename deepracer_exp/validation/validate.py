@@ -27,10 +27,11 @@ from deepracer_exp.training.plan import TrainPlan
 from . import pitfalls
 from .aws_dry_run import dry_run_findings
 from .aws_rules import AwsFinding, text_findings
+from .coverage import Coverage, never_executed
 from .laps import action_space_laps, flawed_laps
 from .objects import with_others
 from .pitfalls import LapReturn
-from .probe import NOT_CALLED, Answer, Coverage, Probe, lines_for_step_1, never_executed
+from .probe import NOT_CALLED, Answer, Probe, lines_for_step_1
 from .reward_map import RewardGrid, State, draw_reward_map, sample_reward_grid, state_of
 from .short_training import train_shortly
 from .situations import (

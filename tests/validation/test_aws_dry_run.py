@@ -68,11 +68,24 @@ def test_an_import_is_refused_where_it_is_executed_while_the_function_is_called(
     assert findings(function("1.0", body.format("> 1"))) == []
 
 
-@pytest.mark.parametrize("expression", ["{}.sum()", "{}.all()", "{}.max()", "np.average({})"])
+@pytest.mark.parametrize(
+    "expression", ["{}.sum()", "{}.all()", "{}.max()", "np.average({})", "np.clip(1.0, {}, 2.0)[0]"]
+)
 def test_methods_of_arrays_that_import_a_module_in_the_validator_are_found(findings, expression):
     text = function(f"float({expression.format('a')})", "a = np.ones(3)\n    ")
     (found,) = findings(text)
-    assert found.startswith("numpy._core._methods is imported while the function is called")
+    assert "imports a module while the function is called" in found
+
+
+def test_a_module_that_a_library_loads_while_the_function_is_called_is_found(findings):
+    (found,) = findings(function("float(np.random.uniform())"))
+    assert found.startswith("numpy.random is imported while the function is called")
+    assert findings("import numpy.random  # noqa: F401\n" + function("float(np.random.uniform())")) == []
+
+
+def test_a_method_that_the_text_defines_is_no_array_s(findings):
+    head = "class Lap:\n    def max(self):\n        return 1.0\n\n\nlap = Lap()\n"
+    assert findings(head + function("lap.max()")) == []
 
 
 @pytest.mark.parametrize("name", ["sum", "all", "max", "mean", "std", "linalg.norm", "argmin"])
@@ -84,6 +97,17 @@ def test_functions_of_numpy_are_accepted(findings, name):
 def test_what_is_no_function_is_refused_in_one_line(findings, value):
     (found,) = findings(f"reward_function = {value}\n")
     assert found.startswith(f"reward_function is {'<built-in function max>' if value == 'max' else value}")
+
+
+def test_what_a_function_writes_is_no_result(findings):
+    writes = "os.write(1, b'[]'); sys.stdout.write('[]')\n    "
+    assert findings("import os\nimport sys\n" + function("1.0", writes)) == []
+
+
+@pytest.mark.parametrize("line", ["os._exit(0)", "os._exit(7)", "sys.exit(0)"])
+def test_a_function_that_leaves_its_process_is_refused(findings, line):
+    assert findings("import os\nimport sys\n" + function("1.0", f"{line}\n    "))
+    assert findings(f"import os\nimport sys\n{line}\n" + function("1.0"))
 
 
 def test_a_function_that_hangs_is_refused(findings, monkeypatch):
