@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -126,7 +127,7 @@ class Features:
     ):
         self._config, self._tracks = config, tracks
         self._ahead_ndist = np.asarray(config.lookahead_m) / tracks.length_m[:, None]
-        self._scales = (
+        self._scales = _Scales(
             float(config.speed_scale_mps),
             float(config.yaw_rate_scale_radps),
             float(steering_max_deg),
@@ -155,7 +156,7 @@ class Features:
         """
         config = self._config
         out = np.empty((len(now.front), len(self.names)), np.float32)
-        _features(
+        observed = _Observed(
             now.front,
             now.yaw_rad,
             now.speed_mps,
@@ -167,12 +168,9 @@ class Features:
             track_index,
             steering_deg,
             commanded_mps,
-            self._scales,
-            self._tracks.lines[0],
-            self._tracks.closed,
-            self._ahead_ndist,
-            out,
         )
+        center, closed = self._tracks.lines[0], self._tracks.closed
+        _features(observed, self._scales, center, closed, self._ahead_ndist, out)
         end = 7 + 2 * len(config.lookahead_m)
         if config.next_objects:
             begin, end = end, end + len(OTHERS) * config.next_objects
@@ -183,39 +181,51 @@ class Features:
         return out
 
 
+class _Scales(NamedTuple):
+    """What features are divided by."""
+
+    speed_mps: float
+    yaw_rate_radps: float
+    steering_deg: float
+    commanded_mps: float
+    lookahead_m: float
+
+
+class _Observed(NamedTuple):
+    """What features are made of; arrays as in `Measures` and `Features.compute`."""
+
+    front: np.ndarray
+    yaw_rad: np.ndarray
+    speed_mps: np.ndarray
+    yaw_rate_radps: np.ndarray
+    ndist: np.ndarray
+    offset_m: np.ndarray
+    heading_error_rad: np.ndarray
+    track_width_m: np.ndarray
+    track_index: np.ndarray
+    steering_deg: np.ndarray
+    commanded_mps: np.ndarray
+
+
 @compiled
-def _features(  # type: ignore[no-untyped-def]
-    front,
-    yaw_rad,
-    speed_mps,
-    yaw_rate_radps,
-    ndist,
-    offset_m,
-    heading_error_rad,
-    track_width_m,
-    track_index,
-    steering_deg,
-    commanded_mps,
-    scales,
-    center,
-    closed,
-    ahead_ndist,
-    out,
-):
-    """Write the features up to those of the look-ahead distances; arrays as in `Measures` and `Features.compute`."""
-    speed_scale_mps, rate_scale_radps, steering_max_deg, speed_max_mps, ahead_scale_m = scales
+def _features(observed, scales, center, closed, ahead_ndist, out):  # type: ignore[no-untyped-def]
+    """Write the features up to those of the look-ahead distances.
+
+    `center` are the centre lines, of which some are closed, `ahead_ndist` the distances as shares of them, (W, D).
+    """
+    front = observed.front
     for car in range(len(out)):
-        line = track_index[car]
-        out[car, 0] = 2 * offset_m[car] / track_width_m[car]
-        out[car, 1] = math.sin(heading_error_rad[car])
-        out[car, 2] = math.cos(heading_error_rad[car])
-        out[car, 3] = speed_mps[car] / speed_scale_mps
-        out[car, 4] = yaw_rate_radps[car] / rate_scale_radps
-        out[car, 5] = steering_deg[car] / steering_max_deg
-        out[car, 6] = commanded_mps[car] / speed_max_mps
-        cos, sin = math.cos(yaw_rad[car]) / ahead_scale_m, math.sin(yaw_rad[car]) / ahead_scale_m
+        line, yaw_rad = observed.track_index[car], observed.yaw_rad[car]
+        out[car, 0] = 2 * observed.offset_m[car] / observed.track_width_m[car]
+        out[car, 1] = math.sin(observed.heading_error_rad[car])
+        out[car, 2] = math.cos(observed.heading_error_rad[car])
+        out[car, 3] = observed.speed_mps[car] / scales.speed_mps
+        out[car, 4] = observed.yaw_rate_radps[car] / scales.yaw_rate_radps
+        out[car, 5] = observed.steering_deg[car] / scales.steering_deg
+        out[car, 6] = observed.commanded_mps[car] / scales.commanded_mps
+        cos, sin = math.cos(yaw_rad) / scales.lookahead_m, math.sin(yaw_rad) / scales.lookahead_m
         for number in range(ahead_ndist.shape[1]):
-            x, y, _ = pose_at(center, closed[line], line, ndist[car] + ahead_ndist[line, number])
+            x, y, _ = pose_at(center, closed[line], line, observed.ndist[car] + ahead_ndist[line, number])
             dx, dy = x - front[car, 0], y - front[car, 1]
             out[car, 7 + 2 * number] = dx * cos + dy * sin
             out[car, 8 + 2 * number] = dy * cos - dx * sin

@@ -27,7 +27,7 @@ from .rules import RaceRules, StepResult
 from .setup import RaceSetup
 from .state import Measures, checked_array
 from .trace import OTHERS_PACKED, PACKED, RIVAL_PACKED
-from .trace_rows import row_dtype, write_rows
+from .trace_rows import Driven, Lengths, row_dtype, write_rows
 
 _KEPT = (
     *("_return", "_steering_deg", "_commanded_mps"),
@@ -155,6 +155,7 @@ class Race:
         self.trace = np.zeros((n_cars, len(PACKED) + len(extra)))
         self.trace[:, PACKED["car"]] = self.cars
         self._row = row_dtype(extra)
+        self._lengths = Lengths(*self.rules.tracks.waypoints, self.rules.tracks.length_m, self._period_s)
         self._no_action = np.full(n_cars, np.nan)
         self.seed(setup.seed)
 
@@ -385,32 +386,24 @@ class Race:
         self, result: StepResult, action: np.ndarray, steering_deg: np.ndarray, speed_mps: np.ndarray
     ) -> None:
         rules, now = self.rules, result.now
-        write_rows(
-            self.trace.view(self._row)[:, 0],
-            rules.episode,
-            rules.steps,
+        driven = Driven(
             now.front,
             now.yaw_rad,
+            now.speed_mps,
+            now.closest_waypoints,
             steering_deg,
             speed_mps,
             action.astype(np.float64) if action.ndim == 1 else self._no_action,
             self.reward,
-            self.terminated,
-            self.truncated,
+            self._return,
             result.all_wheels_on_track,
             result.progress,
-            now.closest_waypoints,
-            *rules.tracks.waypoints,
-            rules.tracks.length_m,
-            rules.course,
-            rules.track_index,
-            rules.clock_steps,
-            self._period_s,
             result.status,
-            now.speed_mps,
-            self._return,
+            self.terminated,
+            self.truncated,
             self.randomization.values,
         )
+        write_rows(self.trace.view(self._row)[:, 0], rules.episodes, driven, self._lengths)
         if self.others is not None:
             row, first = self.trace, len(PACKED)
             row[:, first], row[:, first + 1] = rules.episode, self.others.bots_stopped

@@ -1,6 +1,7 @@
 """The passes of the rules over the cars, compiled; `rules` says what each rule is."""
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,44 +36,48 @@ def lap_progress(ndist, start_ndist, previous):  # type: ignore[no-untyped-def]
     return p, p
 
 
+class Judged(NamedTuple):
+    """What the rules judge of a control step, of one car or in arrays with a row per car; see `EpisodeRules.apply`."""
+
+    steps: Any
+    progress: Any
+    last_progress: Any
+    moved_m: Any
+    off_track: Any
+
+
 @compiled
-def judge_cars(  # type: ignore[no-untyped-def]
-    steps, progress, last_progress, moved_m, off_track, limits, still, falling, codes, status
-):
+def judge_cars(judged, still, falling, rules, status):  # type: ignore[no-untyped-def]
     """Write every car's status code and counters; see `EpisodeRules.apply`."""
-    for car in range(len(steps)):
-        status[car], still[car], falling[car] = judge_car(
-            steps[car],
-            progress[car],
-            last_progress[car],
-            moved_m[car],
-            off_track[car],
-            limits,
-            still[car],
-            falling[car],
-            codes,
+    for car in range(len(status)):
+        of_car = Judged(
+            judged.steps[car],
+            judged.progress[car],
+            judged.last_progress[car],
+            judged.moved_m[car],
+            judged.off_track[car],
         )
+        status[car], still[car], falling[car] = judge_car(of_car, still[car], falling[car], rules)
 
 
 @compiled
-def judge_car(  # type: ignore[no-untyped-def]
-    step, progress, last_progress, moved_m, off_track, limits, still, falling, codes
-):
+def judge_car(judged, still, falling, rules):  # type: ignore[no-untyped-def]
     """Return a car's status code, and for how many steps it has now stood and driven backwards.
 
-    Args: see `EpisodeRules`; `codes` are those of `rules`.
+    `judged` is of one car; `rules` are the limits of `EpisodeRules` and the codes of `rules`.
     """
+    limits, codes = rules
     max_steps, immobilized_steps, immobilized_m, reversed_steps = limits
     prepare, in_progress, reverse, immobilized, off, lap_complete, time_up = codes
-    if step <= 1:
+    if judged.steps <= 1:
         return prepare, 0, 0
-    still = still + 1 if moved_m <= immobilized_m else 0
-    falling = falling + 1 if progress < last_progress else 0
-    if max_steps and step >= max_steps:
+    still = still + 1 if judged.moved_m <= immobilized_m else 0
+    falling = falling + 1 if judged.progress < judged.last_progress else 0
+    if max_steps and judged.steps >= max_steps:
         status = time_up
-    elif progress >= 100.0:
+    elif judged.progress >= 100.0:
         status = lap_complete
-    elif off_track:
+    elif judged.off_track:
         status = off
     elif immobilized_steps and still >= immobilized_steps:
         status = immobilized
@@ -84,123 +89,142 @@ def judge_car(  # type: ignore[no-untyped-def]
 
 
 @compiled
-def wheels_of_cars(road, track_index, x_m, y_m, yaw_rad, wheels_m):  # type: ignore[no-untyped-def]
+def wheels_of_cars(road, track_index, poses, wheels_m):  # type: ignore[no-untyped-def]
     """Return which wheels of every car are on the road, (N, 4); see `wheels_on_road`."""
+    x_m, y_m, yaw_rad = poses
     on = np.empty((len(x_m), len(wheels_m)), np.bool_)
     for car in range(len(x_m)):
         line = track_index[car if len(track_index) > 1 else 0]
-        wheels_of_car(road, line, x_m[car], y_m[car], yaw_rad[car], wheels_m, on[car])
+        wheels_of_car(road, line, (x_m[car], y_m[car], yaw_rad[car]), wheels_m, on[car])
     return on
 
 
 @compiled
-def wheels_of_car(road, line, x_m, y_m, yaw_rad, wheels_m, on):  # type: ignore[no-untyped-def]
-    """Write which wheels of a car are on the road, (4,)."""
+def wheels_of_car(road, line, pose, wheels_m, on):  # type: ignore[no-untyped-def]
+    """Write which wheels of a car at x, y and yaw are on the road, (4,)."""
+    x_m, y_m, yaw_rad = pose
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     for wheel in range(len(wheels_m)):
         ahead, left = wheels_m[wheel, 0], wheels_m[wheel, 1]
         on[wheel] = is_on_road(road, line, x_m + cos * ahead - sin * left, y_m + sin * ahead + cos * left)
 
 
+class Episodes(NamedTuple):
+    """Where N cars are in their episodes: arrays with a row per car, changed in place; see `RaceRules`."""
+
+    cars: np.ndarray
+    """Numbers of the cars over all processes."""
+    course: np.ndarray
+    track_index: np.ndarray
+    driven: np.ndarray
+    """Episodes that a car has begun on each course, (N, courses)."""
+    episode: np.ndarray
+    start_ndist: np.ndarray
+    steps: np.ndarray
+    clock_steps: np.ndarray
+    previous: np.ndarray
+    """Second result of `lap_progress`."""
+    last_progress: np.ndarray
+    last_front: np.ndarray
+    still: np.ndarray
+    """For how many steps a car has stood, and driven backwards."""
+    falling: np.ndarray
+
+
+class Starts(NamedTuple):
+    """Where episodes begin."""
+
+    offset: float
+    """Of the first, and of each after it: shares of the lap."""
+    advance: float
+    first_track: np.ndarray
+    """Of each course: index of its track in the first direction, and in how many it is driven, (courses,)."""
+    turns: np.ndarray
+
+
 @compiled
-def begin_episodes(  # type: ignore[no-untyped-def]
-    ids,
-    cars,
-    course,
-    begins,
-    start_offset,
-    start_advance,
-    first_track,
-    turns,
-    center,
-    closed,
-    episode,
-    driven,
-    track_index,
-    start_ndist,
-    steps,
-    previous,
-    last_progress,
-    still,
-    falling,
-):
+def begin_episodes(ids, begins, episodes, starts, center, closed):  # type: ignore[no-untyped-def]
     """Begin an episode with each of the cars `ids` and return its start pose; see `RaceRules.reset`.
 
-    Arrays from `episode` on are changed in place. `begins` has no entry where the start advances.
+    `episodes` are changed in place. `begins` has no entry where the start advances; `center` are the centre lines, of
+    which some are closed.
     """
     x, y, yaw_rad = np.empty(len(ids)), np.empty(len(ids)), np.empty(len(ids))
     for i in range(len(ids)):
         car = ids[i]
-        episode[car] += 1
-        where = course[car]
-        line = track_index[car] = first_track[where] + driven[car, where] % turns[where]
-        driven[car, where] += 1
+        episodes.episode[car] += 1
+        where = episodes.course[car]
+        line = starts.first_track[where] + episodes.driven[car, where] % starts.turns[where]
+        episodes.track_index[car] = line
+        episodes.driven[car, where] += 1
         if len(begins):
-            start_ndist[car] = begins[i]
+            episodes.start_ndist[car] = begins[i]
         else:
             # An open course is driven from its start: from anywhere else it could not be completed.
-            advanced = cars[car] + episode[car] if closed[line] else 0
-            start_ndist[car] = (start_offset + start_advance * advanced) % 1.0
-        steps[car] = still[car] = falling[car] = 0
-        previous[car] = last_progress[car] = 0.0
-        x[i], y[i], yaw_rad[i] = pose_at(center, closed[line], line, start_ndist[car])
+            advanced = episodes.cars[car] + episodes.episode[car] if closed[line] else 0
+            episodes.start_ndist[car] = (starts.offset + starts.advance * advanced) % 1.0
+        episodes.steps[car] = episodes.still[car] = episodes.falling[car] = 0
+        episodes.previous[car] = episodes.last_progress[car] = 0.0
+        x[i], y[i], yaw_rad[i] = pose_at(center, closed[line], line, episodes.start_ndist[car])
     return x, y, yaw_rad
 
 
+class Rules(NamedTuple):
+    """The rules of a race."""
+
+    limits: tuple[int, int, float, int]
+    """Of `EpisodeRules`."""
+    codes: tuple[int, ...]
+    """Those of `rules`, which also has `endings`."""
+    endings: tuple[int, ...]
+    lap_terminates: bool
+    wheels_m: np.ndarray
+    """Wheels ahead and to the left of the chassis origin, (4, 2)."""
+
+
+class Places(NamedTuple):
+    """Where cars are: the arrays of `Measures` that the rules need."""
+
+    x_m: np.ndarray
+    y_m: np.ndarray
+    yaw_rad: np.ndarray
+    front: np.ndarray
+    ndist: np.ndarray
+
+
 @compiled
-def step_cars(  # type: ignore[no-untyped-def]
-    x_m,
-    y_m,
-    yaw_rad,
-    front,
-    ndist,
-    track_index,
-    closed,
-    road,
-    wheels_m,
-    start_ndist,
-    limits,
-    lap_terminates,
-    codes,
-    endings,
-    steps,
-    clock_steps,
-    previous,
-    last_progress,
-    last_front,
-    still,
-    falling,
-):
+def step_cars(places, episodes, rules, closed, road):  # type: ignore[no-untyped-def]
     """Apply the rules to one control step of every car and return the arrays of `StepResult` from `running` on.
 
-    Arrays from `steps` on are changed in place.
+    `episodes` are changed in place; `closed` and `road` are those of `Tracks`.
     """
-    cars = len(x_m)
+    cars, wheels_m = len(places.x_m), rules.wheels_m
+    steps, previous, last_progress = episodes.steps, episodes.previous, episodes.last_progress
+    last_front, still, falling = episodes.last_front, episodes.still, episodes.falling
     running, percent, before = np.empty(cars, np.bool_), np.empty(cars), np.empty(cars)
     all_on, off_track = np.empty(cars, np.bool_), np.empty(cars, np.bool_)
     status, wheels_on = np.empty(cars, np.int64), np.empty(len(wheels_m), np.bool_)
     for car in range(cars):
         steps[car] += 1
-        clock_steps[car] += 1
+        episodes.clock_steps[car] += 1
         running[car] = steps[car] > 1
-        percent[car], previous[car] = lap_progress(ndist[car], start_ndist[car], previous[car])
-        wheels_of_car(road, track_index[car], x_m[car], y_m[car], yaw_rad[car], wheels_m, wheels_on)
+        percent[car], previous[car] = lap_progress(
+            places.ndist[car], episodes.start_ndist[car], previous[car]
+        )
+        pose = places.x_m[car], places.y_m[car], places.yaw_rad[car]
+        wheels_of_car(road, episodes.track_index[car], pose, wheels_m, wheels_on)
         all_on[car], off_track[car] = wheels_on.all(), not wheels_on.any()
-        x, y = front[car, 0], front[car, 1]
+        x, y = places.front[car, 0], places.front[car, 1]
+        moved_m = math.hypot(x - last_front[car, 0], y - last_front[car, 1])
+        judged = Judged(steps[car], percent[car], last_progress[car], moved_m, off_track[car])
         status[car], still[car], falling[car] = judge_car(
-            steps[car],
-            percent[car],
-            last_progress[car],
-            math.hypot(x - last_front[car, 0], y - last_front[car, 1]),
-            off_track[car],
-            limits,
-            still[car],
-            falling[car],
-            codes,
+            judged, still[car], falling[car], (rules.limits, rules.codes)
         )
         before[car] = last_progress[car] if steps[car] > 2 else percent[car]
         last_progress[car], last_front[car, 0], last_front[car, 1] = percent[car], x, y
-    terminated, truncated = endings_of(status, track_index, closed, lap_terminates, endings)
+    terminated, truncated = endings_of(
+        status, episodes.track_index, closed, rules.lap_terminates, rules.endings
+    )
     return running, percent, before, all_on, off_track, status, terminated, truncated
 
 

@@ -12,7 +12,18 @@ from deepracer_exp.rewards.params import TrackParams
 from deepracer_exp.sim.batch import CarState
 from deepracer_exp.tracks.track import Pose, Tracks
 
-from .rule_passes import begin_episodes, endings_of, judge_cars, step_cars, wheels_of_cars
+from .rule_passes import (
+    Episodes,
+    Judged,
+    Places,
+    Rules,
+    Starts,
+    begin_episodes,
+    endings_of,
+    judge_cars,
+    step_cars,
+    wheels_of_cars,
+)
 from .setup import RaceSetup, courses_of_cars
 from .state import Floats, Measures, checked_array
 from .trace import STATUS_CODE
@@ -87,8 +98,8 @@ class EpisodeRules:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore the counters of a `state_dict`."""
-        self._still = checked_array(state, "still", self._still.shape)
-        self._falling = checked_array(state, "falling", self._falling.shape)
+        self._still[:] = checked_array(state, "still", self._still.shape)
+        self._falling[:] = checked_array(state, "falling", self._falling.shape)
 
     def apply(
         self,
@@ -104,9 +115,8 @@ class EpisodeRules:
         is on the road. Where several rules hold, the service's priority decides: time_up, lap_complete, the others.
         """
         status = np.empty(len(steps), np.int64)
-        judge_cars(
-            steps, progress, last_progress, moved_m, off_track, self.limits, *self.counters, _CODES, status
-        )
+        judged = Judged(steps, progress, last_progress, moved_m, off_track)
+        judge_cars(judged, *self.counters, (self.limits, _CODES), status)
         return status
 
 
@@ -147,6 +157,7 @@ class RaceRules:
         track_params: the params of a reward function that are constant on each of these.
         course: index of each car's course in `setup.courses`, (N,).
         track_index: index of its track in `tracks` and `track_params`, (N,).
+        episodes: these arrays and more, for compiled code, which changes them in place: none may be replaced.
     """
 
     def __init__(self, setup: RaceSetup, n_cars: int, first_car: int = 0):
@@ -156,16 +167,14 @@ class RaceRules:
         tracks = [track for course in setup.courses for track in course.tracks]
         self.tracks = Tracks(tracks)
         self.track_params = tuple(map(TrackParams.of, tracks))
-        self._turns = np.array([len(course.tracks) for course in setup.courses])
-        self._first_track = np.cumsum(self._turns) - self._turns
+        turns = np.array([len(course.tracks) for course in setup.courses])
+        first_track = np.cumsum(turns) - turns
         weights = [course.weight for course in setup.courses]
         self.course = courses_of_cars(weights, first_car + n_cars)[first_car:]
-        self.track_index = self._first_track[self.course]
-        self._driven = np.zeros((n_cars, len(self._turns)), np.int64)
+        self.track_index = first_track[self.course]
+        self._driven = np.zeros((n_cars, len(turns)), np.int64)
         self._period_s = setup.car.control_period_s
         self._front_point_m = setup.car.front_point_m
-        self._wheels_m = np.array(setup.car.wheel_points_m, np.float64)
-        self._episodes = setup.episode
         self._episode_rules = EpisodeRules(setup.episode, n_cars)
         self._everyone = np.arange(n_cars)
         self.now: Measures
@@ -176,6 +185,28 @@ class RaceRules:
         self._previous = np.zeros(n_cars)
         self._last_progress = np.zeros(n_cars)
         self._last_front = np.zeros((n_cars, 2))
+        self.episodes = Episodes(
+            self.cars,
+            self.course,
+            self.track_index,
+            self._driven,
+            self.episode,
+            self.start_ndist,
+            self.steps,
+            self.clock_steps,
+            self._previous,
+            self._last_progress,
+            self._last_front,
+            *self._episode_rules.counters,
+        )
+        self._starts = Starts(setup.episode.start_offset, setup.episode.start_advance, first_track, turns)
+        self._rules = Rules(
+            self._episode_rules.limits,
+            _CODES,
+            _ENDINGS,
+            setup.episode.lap_terminates,
+            np.array(setup.car.wheel_points_m, np.float64),
+        )
 
     def restart(self) -> None:
         """Start over: clocks at 0, and the next episode is the first."""
@@ -204,27 +235,9 @@ class RaceRules:
         ids = self._everyone if ids is None else ids
         if course is not None:
             self.course[ids] = course
-        pose = begin_episodes(
-            ids,
-            self.cars,
-            self.course,
-            _NOWHERE if start_ndist is None else np.asarray(start_ndist, np.float64),
-            self._episodes.start_offset,
-            self._episodes.start_advance,
-            self._first_track,
-            self._turns,
-            self.tracks.lines[0],
-            self.tracks.closed,
-            self.episode,
-            self._driven,
-            self.track_index,
-            self.start_ndist,
-            self.steps,
-            self._previous,
-            self._last_progress,
-            *self._episode_rules.counters,
-        )
-        return Pose(*pose)
+        begins = _NOWHERE if start_ndist is None else np.asarray(start_ndist, np.float64)
+        center, closed = self.tracks.lines[0], self.tracks.closed
+        return Pose(*begin_episodes(ids, begins, self.episodes, self._starts, center, closed))
 
     def put_back(self, ids: Ids, percent: np.ndarray) -> Pose:
         """Continue the cars' episodes from another place and return where their chassis origins are put.
@@ -260,7 +273,8 @@ class RaceRules:
             BadInput: it is of another number of cars or tracks.
         """
         for name, key in _KEPT.items():
-            setattr(self, name, checked_array(state, key, getattr(self, name).shape))
+            array = getattr(self, name)
+            array[:] = checked_array(state, key, array.shape)
         self._episode_rules.load_state_dict(state["rules"])
         self.now = Measures.from_state_dict(state["now"], self.n_cars)
 
@@ -278,35 +292,13 @@ class RaceRules:
     def apply(self) -> StepResult:
         """Apply the rules to the measured poses: one control step of every car."""
         now = self.now
-        return StepResult(
-            now,
-            *step_cars(
-                now.x_m,
-                now.y_m,
-                now.yaw_rad,
-                now.front,
-                now.ndist,
-                self.track_index,
-                self.tracks.closed,
-                self.tracks.road,
-                self._wheels_m,
-                self.start_ndist,
-                self._episode_rules.limits,
-                self._episodes.lap_terminates,
-                _CODES,
-                _ENDINGS,
-                self.steps,
-                self.clock_steps,
-                self._previous,
-                self._last_progress,
-                self._last_front,
-                *self._episode_rules.counters,
-            ),
-        )
+        places = Places(now.x_m, now.y_m, now.yaw_rad, now.front, now.ndist)
+        closed, road = self.tracks.closed, self.tracks.road
+        return StepResult(now, *step_cars(places, self.episodes, self._rules, closed, road))
 
     def ends(self, status: NDArray[np.int64]) -> tuple[Bools, Bools]:
         """Return which status codes of all cars, (N,), terminate their episodes, and which cut them off, (N,) each."""
-        lap_terminates, closed = self._episodes.lap_terminates, self.tracks.closed
+        lap_terminates, closed = self._rules.lap_terminates, self.tracks.closed
         terminated, truncated = endings_of(status, self.track_index, closed, lap_terminates, _ENDINGS)
         return terminated, truncated
 
@@ -354,4 +346,4 @@ def wheels_on_road(
     """
     wheels_m = np.asarray(wheels_m, np.float64)
     poses = (np.ascontiguousarray(values, np.float64) for values in (x_m, y_m, yaw_rad))
-    return np.asarray(wheels_of_cars(tracks.road, track_index, *poses, wheels_m))
+    return np.asarray(wheels_of_cars(tracks.road, track_index, tuple(poses), wheels_m))

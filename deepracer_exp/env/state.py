@@ -69,9 +69,8 @@ class Measures:
     @classmethod
     def of(cls, car: CarState, front_point_m: float, tracks: Tracks, track_index: TrackIndex) -> "Measures":
         """Measure cars (N,), whose front point is `front_point_m` ahead of the origin, each against its course (N,)."""
-        measured = _measure(
-            car.x_m, car.y_m, car.yaw_rad, front_point_m, *tracks.lines, tracks.clockwise, track_index
-        )
+        poses = car.x_m, car.y_m, car.yaw_rad
+        measured = _measure(poses, front_point_m, tracks.lines, tracks.clockwise, track_index)
         return cls(car.x_m, car.y_m, car.yaw_rad, car.speed_mps, car.yaw_rate_radps, *measured)
 
     @classmethod
@@ -108,8 +107,10 @@ class Measures:
 
 
 @compiled
-def _measure(x_m, y_m, yaw_rad, front_point_m, center, inner, outer, clockwise, track_index):  # type: ignore[no-untyped-def]
-    """Return the arrays of `Measures` from `front` on."""
+def _measure(poses, front_point_m, lines, clockwise, track_index):  # type: ignore[no-untyped-def]
+    """Return the arrays of `Measures` from `front` on; `lines` are those of `Tracks`."""
+    x_m, y_m, yaw_rad = poses
+    center, inner, outer = lines
     cars = len(x_m)
     front, ndist, closest = np.empty((cars, 2)), np.empty(cars), np.empty((cars, 2), np.int64)
     distance_m, offset_m, error_rad = np.empty(cars), np.empty(cars), np.empty(cars)

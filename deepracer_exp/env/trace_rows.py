@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,54 +26,68 @@ def row_dtype(extra: Sequence[str] = ()) -> np.dtype[np.void]:
     return np.dtype(fields)
 
 
+class Driven(NamedTuple):
+    """What a control step was: arrays with a row per car."""
+
+    front: np.ndarray
+    """(N, 2)."""
+    yaw_rad: np.ndarray
+    speed_mps: np.ndarray
+    """Measured."""
+    closest_waypoints: np.ndarray
+    """(N, 2)."""
+    steering_deg: np.ndarray
+    """Commanded, as `throttle_mps`."""
+    throttle_mps: np.ndarray
+    action: np.ndarray
+    """Numbers of actions, float64; NaN for a continuous space."""
+    reward: np.ndarray
+    episode_return: np.ndarray
+    all_wheels_on_track: np.ndarray
+    progress: np.ndarray
+    status: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    randomized: np.ndarray
+    """Quantities of `trace.RANDOMIZED`, (N, Q)."""
+
+
+class Lengths(NamedTuple):
+    """What all steps have in common."""
+
+    waypoints: np.ndarray
+    """Those of `Tracks.waypoints`, as `first_waypoint`."""
+    first_waypoint: np.ndarray
+    length_m: np.ndarray
+    """Of the tracks, (W,)."""
+    period_s: float
+
+
 @compiled
-def write_rows(  # type: ignore[no-untyped-def]
-    rows,
-    episode,
-    steps,
-    front,
-    yaw_rad,
-    steering_deg,
-    speed_mps,
-    action,
-    reward,
-    terminated,
-    truncated,
-    all_wheels_on_track,
-    progress,
-    closest_waypoints,
-    waypoints,
-    first_waypoint,
-    length_m,
-    course,
-    track_index,
-    clock_steps,
-    period_s,
-    status,
-    measured_mps,
-    episode_return,
-    randomized,
-):
+def write_rows(rows, episodes, driven, lengths):  # type: ignore[no-untyped-def]
     """Write the columns of a control step; those that are not named stay as they are.
 
-    `rows` are `row_dtype` records, (N,), whose columns are those of `trace.PACKED_COLUMNS`. Front points are (N, 2),
-    closest waypoints (N, 2), waypoints those of `Tracks.waypoints`, commanded steering and speed (N,), numbers of
-    actions float64, NaN for a continuous space, lengths those of the tracks, (W,), and randomized quantities those of
-    `trace.RANDOMIZED`, (N, Q); the rest is (N,).
+    `rows` are `row_dtype` records, (N,), whose columns are those of `trace.PACKED_COLUMNS`.
     """
+    randomized = driven.randomized
     for car in range(len(rows)):
-        row = rows[car]
-        row.episode, row.steps = episode[car], steps[car]
-        row.X, row.Y, row.yaw = front[car, 0], front[car, 1], math.degrees(yaw_rad[car])
-        row.steer, row.throttle, row.action = steering_deg[car], speed_mps[car], action[car]
-        row.reward, row.episode_return = reward[car], episode_return[car]
-        row.done = terminated[car] or truncated[car]
-        row.all_wheels_on_track = all_wheels_on_track[car]
-        first = first_waypoint[track_index[car]]
-        row.closest_waypoint = nearer_of(closest_waypoints[car], front[car], waypoints, first)
-        row.progress = progress[car]
-        row.track_len, row.track = length_m[track_index[car]], course[car]
-        row.tstamp = clock_steps[car] * period_s
-        row.episode_status, row.speed_mps = status[car], measured_mps[car]
+        row, track = rows[car], episodes.track_index[car]
+        row.episode, row.steps = episodes.episode[car], episodes.steps[car]
+        row.X, row.Y, row.yaw = driven.front[car, 0], driven.front[car, 1], math.degrees(driven.yaw_rad[car])
+        row.steer, row.throttle, row.action = (
+            driven.steering_deg[car],
+            driven.throttle_mps[car],
+            driven.action[car],
+        )
+        row.reward, row.episode_return = driven.reward[car], driven.episode_return[car]
+        row.done = driven.terminated[car] or driven.truncated[car]
+        row.all_wheels_on_track = driven.all_wheels_on_track[car]
+        row.closest_waypoint = nearer_of(
+            driven.closest_waypoints[car], driven.front[car], lengths.waypoints, lengths.first_waypoint[track]
+        )
+        row.progress = driven.progress[car]
+        row.track_len, row.track = lengths.length_m[track], episodes.course[car]
+        row.tstamp = episodes.clock_steps[car] * lengths.period_s
+        row.episode_status, row.speed_mps = driven.status[car], driven.speed_mps[car]
         for quantity in range(randomized.shape[1]):
             row.randomized[quantity] = randomized[car, quantity]
