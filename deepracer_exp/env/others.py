@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepracer_exp.config.race import RaceConfig
-from deepracer_exp.sim.nearby import next_ones
+from deepracer_exp.sim.nearby import Around, Here, Reach, next_ones
 from deepracer_exp.sim.others import Others
 from deepracer_exp.sim.placement import episode_seeds
 from deepracer_exp.tracks.lanes import INNER, OUTER, Lanes
@@ -206,24 +206,12 @@ class RaceOthers:
         over `speed_scale_mps`; `bot`, 1 for a bot and 0 for a box. One beyond the reach, or none: 1, 0, 0, 0.
         """
         others, rules, seen = self.others, self._rules, self._observation
-        return np.asarray(
-            next_ones(
-                ids,
-                others.distance_m,
-                others.offset_m,
-                others.is_bot,
-                others.speeds_mps(ids, lap_clock_s(rules.steps[ids], self._period_s)),
-                now.ndist * rules.length_m[ids],
-                now.offset_m,
-                now.speed_mps,
-                now.track_width_m,
-                rules.length_m[ids],
-                seen.next_objects,
-                BESIDE_M,
-                seen.next_objects_reach_m,
-                seen.speed_scale_mps,
-            )
-        )
+        speeds_mps = others.speeds_mps(ids, lap_clock_s(rules.steps[ids], self._period_s))
+        theirs = Around(others.distance_m, others.offset_m, others.is_bot, speeds_mps)
+        length_m = rules.length_m[ids]
+        here = Here(now.ndist * length_m, now.offset_m, now.speed_mps, now.track_width_m, length_m)
+        reach = Reach(seen.next_objects, BESIDE_M, seen.next_objects_reach_m, seen.speed_scale_mps)
+        return np.asarray(next_ones(ids, theirs, here, reach))
 
     def boxes(self, ids: Ids) -> NDArray[np.float32]:
         """Return what cameras and LIDARs see of the others of the cars `ids`, (n, K, 9); see `camera.take_pictures`."""

@@ -108,11 +108,11 @@ def draw_placements(
         lanes[of_boxes] = [LANES.index(position.lane) for position in boxes.positions]
     elif boxes.count:
         least_m = _least_m(race, length_m, episode)
-        place(seeds, 0, boxes.placement == "random", least_m, length_m, places_m[of_boxes], lanes[of_boxes])
+        place(seeds, 0, boxes.placement == "random", (least_m, length_m), places_m[of_boxes], lanes[of_boxes])
     if bots.count:
         least_m = np.full(len(seeds), bots.min_distance_m)
         random = bots.placement == "random"
-        place(seeds, boxes.count, random, least_m, length_m, places_m[of_bots], lanes[of_bots])
+        place(seeds, boxes.count, random, (least_m, length_m), places_m[of_bots], lanes[of_bots])
     return places_m, lanes
 
 

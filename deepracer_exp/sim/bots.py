@@ -1,6 +1,9 @@
 """How the service's bots drive: along the lanes at a constant speed, with changes of lanes."""
 
 import math
+from typing import NamedTuple
+
+import numpy as np
 
 from deepracer_exp.compiled import njit
 
@@ -16,29 +19,37 @@ def _between(rows, lane, cell, part, column):  # type: ignore[no-untyped-def]
     return before + part * (rows[lane, cell + 1, column] - before)
 
 
+class Manner(NamedTuple):
+    """How bots drive; see `conf/race`."""
+
+    speed_mps: float
+    pause_s: float
+    least_after_s: float
+    """Least and most time between two changes of lanes; infinite: none is changed."""
+    most_after_s: float
+    change_m: float
+
+
+class Bots(NamedTuple):
+    """The bots of N cars: arrays with a row per car, changed in place; see `sim.others.Others`."""
+
+    start_m: np.ndarray
+    lane: np.ndarray
+    changes: np.ndarray
+    change_begin_s: np.ndarray
+    change_end_s: np.ndarray
+    seed: np.ndarray
+    pauses: np.ndarray
+    poses: np.ndarray
+    distance_m: np.ndarray
+    offset_m: np.ndarray
+
+
 @njit(cache=True, nogil=True)
-def drive(  # type: ignore[no-untyped-def]
-    ids,
-    track_index,
-    time_s,
-    paths,
-    speed_mps,
-    pause_s,
-    least_after_s,
-    most_after_s,
-    change_m,
-    start_m,
-    lane,
-    changes,
-    change_begin_s,
-    change_end_s,
-    seed,
-    pauses,
-    poses,
-    distance_m,
-    offset_m,
-):
-    """Move the bots of some cars to a time, and change their lanes; arrays of state have a row per car."""
+def drive(ids, track_index, time_s, paths, manner, bots):  # type: ignore[no-untyped-def]
+    """Move the bots of the cars `ids` on their tracks to a time, (n,) each, and change their lanes."""
+    speed_mps, pause_s, least_after_s, most_after_s, change_m = manner
+    start_m, lane, changes, change_begin_s, change_end_s, seed, pauses, poses, distance_m, offset_m = bots
     changing, rows = math.isfinite(least_after_s), paths.rows
     for place in range(len(ids)):
         car, track, now_s = ids[place], track_index[place], time_s[place]

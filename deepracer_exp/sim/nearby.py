@@ -1,5 +1,7 @@
 """Which of the others are next to a car along the lap, and what a policy is shown of them."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from deepracer_exp.compiled import njit
@@ -38,71 +40,97 @@ def closest(distance_m, own_m):  # type: ignore[no-untyped-def]
     return nearest
 
 
-@njit(cache=True, nogil=True)
-def next_ones(  # type: ignore[no-untyped-def]
-    ids,
-    distance_m,
-    offset_m,
-    is_bot,
-    speeds_mps,
-    own_m,
-    own_offset_m,
-    own_mps,
-    width_m,
-    length_m,
-    count,
-    behind_m,
-    reach_m,
-    speed_scale_mps,
-):
-    """Return what is shown of the next others of cars in their order along the lap, (n, count * SHOWN), float32.
+class Around(NamedTuple):
+    """The K others of each car."""
 
-    Of each: how far ahead of the car's front it is over `reach_m`; how far to the left of the car it is across the road
-    over half the road's width, -2 to 2; the car's speed less its own over `speed_scale_mps`; and whether it is a bot.
-    One beyond the reach, or none: 1, 0, 0, 0.
+    distance_m: np.ndarray
+    """Along the lap, of all cars' others, (N, K), as `offset_m`."""
+    offset_m: np.ndarray
+    """To the left of the centre line."""
+    is_bot: np.ndarray
+    """Which of the others are cars, (K,)."""
+    speeds_mps: np.ndarray
+    """Of the others of the n cars that are asked for, (n, K)."""
+
+
+class Here(NamedTuple):
+    """Where n cars are: arrays with a row per car."""
+
+    distance_m: np.ndarray
+    """Of the front point along the lap."""
+    offset_m: np.ndarray
+    """Of the same to the left of the centre line."""
+    speed_mps: np.ndarray
+    width_m: np.ndarray
+    """Of the road."""
+    length_m: np.ndarray
+    """Of the lap."""
+
+
+class Reach(NamedTuple):
+    """How many others are shown, and which."""
+
+    number: int
+    behind_m: float
+    """An other counts as ahead until it is so far behind."""
+    ahead_m: float
+    """Up to where others are shown."""
+    speed_scale_mps: float
+    """What closing speeds are divided by."""
+
+
+@njit(cache=True, nogil=True)
+def next_ones(ids, others, here, reach):  # type: ignore[no-untyped-def]
+    """Return what is shown of the next others of the cars `ids` in order along the lap, (n, number * SHOWN), float32.
+
+    Of each: how far ahead of the car's front it is over the reach; how far to the left of the car it is across the road
+    over half the road's width, -2 to 2; the car's speed less its own over the scale; and whether it is a bot. One
+    beyond the reach, or none: 1, 0, 0, 0.
 
     Args:
         ids: indices of the cars, (n,).
-        distance_m: of all cars' others along the lap, (N, K).
-        offset_m: of the same to the left of the centre line, (N, K).
-        is_bot: which of the others are cars, (K,).
-        speeds_mps: of the others of the cars `ids`, (n, K).
-        own_m: of the front points of the cars `ids`, (n,).
-        own_offset_m: of the same to the left, (n,).
-        own_mps: speeds of the cars `ids`, (n,).
-        width_m: of the road, (n,).
-        length_m: of the lap, (n,).
-        count: how many are shown.
-        behind_m: an other counts as ahead until it is so far behind.
-        reach_m: up to where others are shown.
-        speed_scale_mps: see above.
+        others: an `Around`.
+        here: a `Here` of the cars `ids`.
+        reach: a `Reach`.
     """
-    others = distance_m.shape[1]
+    count, _, reach_m, speed_scale_mps = reach
     shown = np.zeros((len(ids), count * SHOWN), np.float32)
     following, gap_m = np.empty(count, np.int64), np.empty(count)
     for row in range(len(ids)):
-        car, listed = ids[row], 0
-        for other in range(others):
-            gap = (distance_m[car, other] - own_m[row] + behind_m) % length_m[row] - behind_m
-            if gap >= reach_m:
-                continue
-            place = min(listed, count - 1)
-            if listed == count and gap >= gap_m[place]:
-                continue
-            while place > 0 and gap < gap_m[place - 1]:
-                following[place], gap_m[place] = following[place - 1], gap_m[place - 1]
-                place -= 1
-            following[place], gap_m[place] = other, gap
-            listed = min(listed + 1, count)
+        car = ids[row]
+        listed = _list_next(
+            others.distance_m[car], here.distance_m[row], here.length_m[row], reach, (following, gap_m)
+        )
         for place in range(count):
             begin = SHOWN * place
             if place >= listed:
                 shown[row, begin] = 1.0
                 continue
             other = following[place]
-            side = 2.0 * (offset_m[car, other] - own_offset_m[row]) / width_m[row]
+            side = 2.0 * (others.offset_m[car, other] - here.offset_m[row]) / here.width_m[row]
             shown[row, begin] = gap_m[place] / reach_m
             shown[row, begin + 1] = min(max(side, -2.0), 2.0)
-            shown[row, begin + 2] = (own_mps[row] - speeds_mps[row, other]) / speed_scale_mps
-            shown[row, begin + 3] = is_bot[other]
+            shown[row, begin + 2] = (here.speed_mps[row] - others.speeds_mps[row, other]) / speed_scale_mps
+            shown[row, begin + 3] = others.is_bot[other]
     return shown
+
+
+@njit(cache=True, nogil=True)
+def _list_next(distance_m, own_m, length_m, reach, listed):  # type: ignore[no-untyped-def]
+    """List the next others of a car within reach and their gaps, nearest first; return how many there are."""
+    count, behind_m, reach_m, _ = reach
+    following, gap_m = listed
+    found = 0
+    for other in range(len(distance_m)):
+        gap = (distance_m[other] - own_m + behind_m) % length_m - behind_m
+        if gap >= reach_m:
+            continue
+        place = min(found, count - 1)
+        if found == count and gap >= gap_m[place]:
+            continue
+        while place > 0 and gap < gap_m[place - 1]:
+            following[place], gap_m[place] = following[place - 1], gap_m[place - 1]
+            place -= 1
+        following[place], gap_m[place] = other, gap
+        found = min(found + 1, count)
+    return found

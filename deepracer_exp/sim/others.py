@@ -16,7 +16,7 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.tracks.lanes import Lanes, Paths
 from deepracer_exp.tracks.track import Track, TrackIndex, Tracks
 
-from .bots import drive
+from .bots import Bots, Manner, drive
 from .collisions import BOX_M, CAR_M, first_hit
 from .placement import END_M
 
@@ -67,6 +67,21 @@ class Others:
         self.pauses = np.zeros(n_cars, np.int64)
         self.resumes_s = np.zeros(n_cars)
         self._going_mps = np.where(self.is_bot, race.bots.speed_mps, 0.0)
+        after_s = race.bots.lane_change_after_s or (math.inf, math.inf)
+        speed_mps, pause_s = race.bots.speed_mps, race.bots.pause_s
+        self._manner = Manner(speed_mps, pause_s, after_s[0], after_s[1], race.bots.lane_change_distance_m)
+        self._bots = Bots(
+            self.start_m,
+            self.lane,
+            self.changes,
+            self.change_begin_s,
+            self.change_end_s,
+            self.seed,
+            self.pauses,
+            self.poses[:, boxes:],
+            self.distance_m[:, boxes:],
+            self.offset_m[:, boxes:],
+        )
 
     def place(
         self,
@@ -154,29 +169,7 @@ class Others:
 
     def _drive(self, ids: Ids, track_index: TrackIndex, time_s: Floats) -> None:
         assert self._paths is not None
-        bots, boxes = self._race.bots, self._boxes
-        after_s = bots.lane_change_after_s or (math.inf, math.inf)
-        drive(
-            ids,
-            track_index,
-            time_s,
-            self._paths,
-            bots.speed_mps,
-            bots.pause_s,
-            after_s[0],
-            after_s[1],
-            bots.lane_change_distance_m,
-            self.start_m,
-            self.lane,
-            self.changes,
-            self.change_begin_s,
-            self.change_end_s,
-            self.seed,
-            self.pauses,
-            self.poses[:, boxes:],
-            self.distance_m[:, boxes:],
-            self.offset_m[:, boxes:],
-        )
+        drive(ids, track_index, time_s, self._paths, self._manner, self._bots)
 
 
 def check_room(race: RaceConfig, tracks: Sequence[tuple[str, Track]]) -> None:

@@ -44,7 +44,7 @@ def episode_seeds(keys, episode):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def place(seeds, first, random, least_m, length_m, places_m, lanes):  # type: ignore[no-untyped-def]
+def place(seeds, first, random, room_m, places_m, lanes):  # type: ignore[no-untyped-def]
     """Place boxes or bots: fill `places_m` with distances along the lap, and `lanes` with 0 or 1, both (n, count).
 
     Spread evenly, lanes alternate. At random, each in turn is moved to anywhere between its neighbours that keeps the
@@ -54,11 +54,11 @@ def place(seeds, first, random, least_m, length_m, places_m, lanes):  # type: ig
         seeds: of the episodes, (n,).
         first: number of the first of these among all others of a car.
         random: whether places are drawn.
-        least_m: least distance between two, and of the first from the start line, (n,).
-        length_m: of the lap, (n,).
+        room_m: least distance between two, and of the first from the start line, (n,); length of the lap, (n,).
         places_m: see above.
         lanes: see above.
     """
+    least_m, length_m = room_m
     rows, count = places_m.shape
     order = np.empty(count, np.int64)
     for row in range(rows):
