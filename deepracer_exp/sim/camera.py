@@ -3,6 +3,8 @@
 Straight edges of the scenery are straight in the picture, which is summed up from them column by column (`edges`).
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -41,27 +43,27 @@ def take_pictures(
     """
     if mounts is None:
         mounts = np.tile(lens.mount, (len(out), 1))
-    _take(
-        np.ascontiguousarray(poses, np.float64),
-        track_index,
-        np.ascontiguousarray(colors, np.float32),
-        scenery.points_m,
-        scenery.joined,
-        scenery.pieces,
-        scenery.first_piece,
-        mounts,
-        out,
-    )
+    scene = _Scene(scenery.points_m, scenery.joined, scenery.pieces, scenery.first_piece)
+    colors = np.ascontiguousarray(colors, np.float32)
+    _take(np.ascontiguousarray(poses, np.float64), mounts, track_index, colors, scene, out)
     if boxes is not None:
         draw_boxes(np.ascontiguousarray(poses, np.float64), boxes, mounts, out)
     return out
 
 
+class _Scene(NamedTuple):
+    """The arrays of a `Scenery`."""
+
+    points: NDArray[np.floating]
+    joined: NDArray[np.bool_]
+    pieces: NDArray[np.void]
+    first_piece: NDArray[np.integer]
+
+
 @njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
-def _take(  # type: ignore[no-untyped-def]
-    poses, track_index, colors, points, joined, pieces, first_piece, mounts, out
-):
+def _take(poses, mounts, track_index, colors, scene, out):  # type: ignore[no-untyped-def]
     """Take the pictures."""
+    points, joined, pieces, first_piece = scene
     cars, channels, height, width = out.shape
     # Edges at the bottom of the picture also change the rows below it, which are not drawn.
     changes = np.zeros((channels, (height + 3) * width), np.float32)
@@ -109,16 +111,9 @@ def _take(  # type: ignore[no-untyped-def]
                         share = (NEAREST_M - b_depth) / (a_depth - b_depth)
                         bx, by, b_depth = bx + share * (ax - bx), by + share * (ay - by), NEAREST_M
                     a_focal, b_focal = focal / a_depth, focal / b_depth
-                    add_edge(
-                        changes,
-                        height,
-                        width,
-                        middle_x + ax * a_focal,
-                        middle_y + ay * a_focal,
-                        middle_x + bx * b_focal,
-                        middle_y + by * b_focal,
-                        change,
-                    )
+                    begin = middle_x + ax * a_focal, middle_y + ay * a_focal
+                    end = middle_x + bx * b_focal, middle_y + by * b_focal
+                    add_edge(changes, (height, width), begin, end, change)
                 was_depth, was_x, was_y = depth, right, down
         for channel in range(channels):
             running[:] = colors[car, 0, channel] + np.float32(0.5)  # the sky, rounded

@@ -141,7 +141,7 @@ def draw_boxes(poses, boxes, mounts, out):  # type: ignore[no-untyped-def]
                 change[channels] = 1.0
                 for point in range(points):
                     begin, end = polygon[(point or points) - 1], polygon[point]
-                    add_edge(changes, height, width, begin[0], begin[1], end[0], end[1], change)
+                    add_edge(changes, (height, width), (begin[0], begin[1]), (end[0], end[1]), change)
                     first_column = min(first_column, int(max(end[0], 0.0)))
                     last_column = max(last_column, int(min(end[0] + 1.0, width)))
                     first_row = min(first_row, int(max(end[1], 0.0)))

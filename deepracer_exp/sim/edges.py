@@ -12,11 +12,15 @@ from deepracer_exp.compiled import njit
 
 
 @njit(cache=True, fastmath=True, error_model="numpy", inline="always")
-def add_edge(changes, height, width, ax, ay, bx, by, change):  # type: ignore[no-untyped-def]
-    """Add an edge from a to b, in pixels: `change` below it where it runs to the right, else its opposite.
+def add_edge(changes, size, begin, end, change):  # type: ignore[no-untyped-def]
+    """Add an edge between two points x, y in pixels: `change` below it where it runs to the right, else its opposite.
 
-    `changes` is (channels, (height + 3) * width): what lies below the picture goes to rows that are not drawn.
+    `size` is the picture's height and width, `changes` (channels, (height + 3) * width): what lies below the picture
+    goes to rows that are not drawn.
     """
+    height, width = size
+    ax, ay = begin
+    bx, by = end
     sign = 1.0
     if ax > bx:
         ax, ay, bx, by, sign = bx, by, ax, ay, -1.0
@@ -30,30 +34,35 @@ def add_edge(changes, height, width, ax, ay, bx, by, change):  # type: ignore[no
         by -= (bx - width) * slope
         bx = np.float64(width)
     if abs(slope) <= 1.0:
-        _add_flat(changes, height, width, ax, ay, bx, slope, sign, change)
+        _add_flat(changes, size, (ax, ay, bx), slope, sign, change)
         return
     # What lies above or below the picture, as if it were level there.
     if min(ay, by) < 0.0:
         x = ax - ay / slope
         if max(ay, by) <= 0.0:
-            _add_flat(changes, height, width, ax, 0.0, bx, 0.0, sign, change)
+            _add_flat(changes, size, (ax, 0.0, bx), 0.0, sign, change)
             return
         if ay < 0.0:
-            _add_flat(changes, height, width, ax, 0.0, x, 0.0, sign, change)
+            _add_flat(changes, size, (ax, 0.0, x), 0.0, sign, change)
             ax, ay = x, 0.0
         else:
-            _add_flat(changes, height, width, x, 0.0, bx, 0.0, sign, change)
+            _add_flat(changes, size, (x, 0.0, bx), 0.0, sign, change)
             bx, by = x, 0.0
     if ay > height:
         ax, ay = ax + (height - ay) / slope, np.float64(height)
     if by > height:
         bx, by = bx + (height - by) / slope, np.float64(height)
-    _add_steep(changes, width, ax, ay, by, 1.0 / slope, sign, change)
+    _add_steep(changes, width, (ax, ay, by), 1.0 / slope, sign, change)
 
 
 @njit(cache=True, fastmath=True, error_model="numpy", inline="always")
-def _add_flat(changes, height, width, ax, ay, bx, slope, sign, change):  # type: ignore[no-untyped-def]
-    """Add an edge column by column; in one it crosses two rows at most. No branches: they would be mispredicted."""
+def _add_flat(changes, size, from_to, slope, sign, change):  # type: ignore[no-untyped-def]
+    """Add an edge column by column; in one it crosses two rows at most. No branches: they would be mispredicted.
+
+    `from_to` is x and y of its left end and x of its right end.
+    """
+    height, width = size
+    ax, ay, bx = from_to
     bottom = np.float64(height)
     for column in range(int(ax), int(np.ceil(bx))):
         begin, end = max(ax, np.float64(column)), min(bx, column + 1.0)
@@ -76,8 +85,12 @@ def _add_flat(changes, height, width, ax, ay, bx, slope, sign, change):  # type:
 
 
 @njit(cache=True, fastmath=True, error_model="numpy", inline="always")
-def _add_steep(changes, width, ax, ay, by, x_per_row, sign, change):  # type: ignore[no-untyped-def]
-    """Add an edge within the picture row by row; in one it crosses two columns at most."""
+def _add_steep(changes, width, from_to, x_per_row, sign, change):  # type: ignore[no-untyped-def]
+    """Add an edge within the picture row by row; in one it crosses two columns at most.
+
+    `from_to` is x and y of its left end and y of its right end.
+    """
+    ax, ay, by = from_to
     x_at = ax - ay * x_per_row
     low, high = min(ay, by), max(ay, by)
     for row in range(int(low), int(np.ceil(high))):
