@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.sim.tyres import DRIVE, car_record, send, tyre_forces
+from deepracer_exp.sim.tyres import DRIVE, Clock, car_record, send, tyre_forces
 
 Floats = NDArray[np.float64]
 Ids = NDArray[np.intp]
@@ -278,8 +278,7 @@ def _replay(cars, drives, observer, substeps, pose, commands, duration_s, first,
             x, y, left = x + com_m * cos, y + com_m * sin, left + com_m * rate
             vx, vy = cos * ahead - sin * left, sin * ahead + cos * left
             for physics_step in range(substeps):
-                speed, steering = commands[window, step]
-                send(car, drive, speed, steering, physics_step, substeps, dt)
+                send(car, drive, commands[window, step], Clock(physics_step, substeps, dt))
                 ahead, left = cos * vx + sin * vy, cos * vy - sin * vx
                 ahead_n, left_n, torque_nm = tyre_forces(car, drive, ahead, left, rate, dt)
                 vx += dt * (cos * ahead_n - sin * left_n) / car["mass_kg"]

@@ -86,7 +86,7 @@ def driven_m(course, front_point_m, com_x_m, states, begin_m, closed):  # type: 
 @njit(cache=True)
 def _roll(cars, drives, states, commands, steps, dt_s):  # type: ignore[no-untyped-def]
     for n in range(len(commands)):
-        advance(cars, drives, states[n], commands[n], steps, dt_s, states[n + 1])
+        advance(cars, drives, states[n], commands[n], (steps, dt_s), states[n + 1])
 
 
 @njit(cache=True)
@@ -262,7 +262,7 @@ def improve(  # type: ignore[no-untyped-def]
     stale = True
     for _ in range(rounds):
         if stale:
-            linearise(cars, drives, states[:-1], commands, steps, dt_s, by_state, by_command)
+            linearise(cars, drives, states[:-1], commands, (steps, dt_s), (by_state, by_command))
             stale = False
         _backward(
             problem,
@@ -286,7 +286,7 @@ def improve(  # type: ignore[no-untyped-def]
                     for j in range(size):
                         value += gain[n, k, j] * (new_states[n, j] - states[n, j])
                     new_commands[n, k] = min(max(value, limits[0, k]), limits[1, k])
-                advance(cars, drives, new_states[n], new_commands[n], steps, dt_s, new_states[n + 1])
+                advance(cars, drives, new_states[n], new_commands[n], (steps, dt_s), new_states[n + 1])
             new_cost = _cost(problem, new_states, new_commands, multipliers, stiffness, calm)
             if new_cost < cost - 1e-7:
                 improved = True

@@ -163,10 +163,9 @@ class Search:
         """Return the states from `start` on that commands (n, 2) lead to, (n + 1, 15)."""
         states = np.empty((len(commands) + 1, len(start)))
         states[0] = start
+        period = self._car.substeps, self._dt_s
         for n, command in enumerate(commands):
-            advance(
-                self._cars, self._drive, states[n], command, self._car.substeps, self._dt_s, states[n + 1]
-            )
+            advance(self._cars, self._drive, states[n], command, period, states[n + 1])
         return states
 
     def _driven_m(self, states: Floats, begin_m: float) -> Floats:

@@ -16,7 +16,7 @@ from deepracer_exp.config.car import CarConfig
 from deepracer_exp.errors import RunFailed
 
 from .car import build_spec
-from .tyres import DRIVE, car_record, push_cars
+from .tyres import DRIVE, Clock, car_record, push_cars
 
 Floats = NDArray[np.float64]
 Ids = NDArray[np.intp]
@@ -126,8 +126,8 @@ class CarBatch:
         _refuse("command", _limit(commands, moving, min_mps, max_mps, self._max_steering_rad))
         steps, dt_s = self.car.substeps, self.model.opt.timestep
         for step in range(steps):
-            yaw = self._qpos[:, 2]
-            push_cars(self._cars, self._drives, yaw, self._qvel, commands, step, steps, dt_s, self._forces)
+            motion, clock = (self._qpos[:, 2], self._qvel), Clock(step, steps, dt_s)
+            push_cars(self._cars, self._drives, motion, commands, clock, self._forces)
             try:
                 self._batch.step()
             except mujoco.batch.SimulationError as error:

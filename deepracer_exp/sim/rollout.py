@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from deepracer_exp.compiled import njit
 from deepracer_exp.config.car import CarConfig
 
-from .tyres import DRIVE, car_record, push_cars
+from .tyres import DRIVE, Clock, car_record, push_cars
 
 Floats = NDArray[np.float64]
 
@@ -52,7 +52,7 @@ def _load(state, drives):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def advance(cars, drives, state, command, steps, dt_s, after):  # type: ignore[no-untyped-def]
+def advance(cars, drives, state, command, period, after):  # type: ignore[no-untyped-def]
     """Advance one car by a control period.
 
     Args:
@@ -60,10 +60,10 @@ def advance(cars, drives, state, command, steps, dt_s, after):  # type: ignore[n
         drives: a `DRIVE` record to work with, (1, 1).
         state: before, (15,).
         command: commanded speed in m/s and steering in radians, (2,).
-        steps: physics steps of a control period.
-        dt_s: length of one.
+        period: physics steps of a control period, and the length of one in seconds.
         after: written: the state after it, (15,).
     """
+    steps, dt_s = period
     _load(state, drives)
     after[:] = state
     velocity, forces, commands = np.empty((1, 3)), np.empty((1, 3)), np.empty((1, 2))
@@ -71,7 +71,7 @@ def advance(cars, drives, state, command, steps, dt_s, after):  # type: ignore[n
     commands[0] = command
     mass_kg, inertia_kgm2 = cars[0].mass_kg, cars[0].yaw_inertia_kgm2
     for step in range(steps):
-        push_cars(cars, drives, after[2:3], velocity, commands, step, steps, dt_s, forces)
+        push_cars(cars, drives, (after[2:3], velocity), commands, Clock(step, steps, dt_s), forces)
         velocity[0, 0] += dt_s * forces[0, 0] / mass_kg
         velocity[0, 1] += dt_s * forces[0, 1] / mass_kg
         velocity[0, 2] += dt_s * forces[0, 2] / inertia_kgm2
@@ -86,7 +86,7 @@ def advance(cars, drives, state, command, steps, dt_s, after):  # type: ignore[n
 
 
 @njit(cache=True)
-def linearise(cars, drives, states, commands, steps, dt_s, by_state, by_command):  # type: ignore[no-untyped-def]
+def linearise(cars, drives, states, commands, period, derivatives):  # type: ignore[no-untyped-def]
     """Write the derivatives of each control period by central differences.
 
     Args:
@@ -94,11 +94,10 @@ def linearise(cars, drives, states, commands, steps, dt_s, by_state, by_command)
         drives: likewise.
         states: at the beginning of each period, (n, 15).
         commands: (n, 2).
-        steps: physics steps of a control period.
-        dt_s: length of one.
-        by_state: written, (n, 15, 15).
-        by_command: written, (n, 15, 2).
+        period: physics steps of a control period, and the length of one in seconds.
+        derivatives: by the state, (n, 15, 15), and by the command, (n, 15, 2): written.
     """
+    by_state, by_command = derivatives
     size = states.shape[1]
     low, high = np.empty(size), np.empty(size)
     for n in range(len(commands)):
@@ -106,18 +105,18 @@ def linearise(cars, drives, states, commands, steps, dt_s, by_state, by_command)
         for k in range(size):
             kept = state[k]
             state[k] = kept + _NUDGE[k]
-            advance(cars, drives, state, command, steps, dt_s, high)
+            advance(cars, drives, state, command, period, high)
             state[k] = kept - _NUDGE[k]
-            advance(cars, drives, state, command, steps, dt_s, low)
+            advance(cars, drives, state, command, period, low)
             state[k] = kept
             for row in range(size):
                 by_state[n, row, k] = (high[row] - low[row]) / (2.0 * _NUDGE[k])
         for k in range(2):
             kept = command[k]
             command[k] = kept + _NUDGE_COMMAND[k]
-            advance(cars, drives, state, command, steps, dt_s, high)
+            advance(cars, drives, state, command, period, high)
             command[k] = kept - _NUDGE_COMMAND[k]
-            advance(cars, drives, state, command, steps, dt_s, low)
+            advance(cars, drives, state, command, period, low)
             command[k] = kept
             for row in range(size):
                 by_command[n, row, k] = (high[row] - low[row]) / (2.0 * _NUDGE_COMMAND[k])

@@ -8,6 +8,8 @@ friction along and across the floor varies with the cosine of the wheel's rotati
 The forces are those of the end of the step (implicit Euler), so that stiff tyres are stable at any step.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -194,8 +196,19 @@ def tyre_forces(car, drive, ahead_mps, left_mps, rate_radps, dt_s):  # type: ign
     )
 
 
+class Clock(NamedTuple):
+    """A physics step of a control period."""
+
+    step: int
+    """Its number, from 0."""
+    steps: int
+    """How many there are."""
+    dt_s: float
+    """Length of one."""
+
+
 @njit(cache=True, error_model="numpy")
-def send(car, drive, speed_mps, steering_rad, step, steps, dt_s):  # type: ignore[no-untyped-def]
+def send(car, drive, command, clock):  # type: ignore[no-untyped-def]
     """Advance a car's steering, and the command that its motors follow, by one physics step.
 
     A command takes effect after the car's delay: in part in the physics step in which the delay ends.
@@ -203,12 +216,11 @@ def send(car, drive, speed_mps, steering_rad, step, steps, dt_s):  # type: ignor
     Args:
         car: a `CAR` record.
         drive: its `DRIVE` record, changed in place.
-        speed_mps: commanded.
-        steering_rad: commanded.
-        step: number of the physics step in the control period, from 0.
-        steps: physics steps in a control period.
-        dt_s: length of a physics step.
+        command: commanded speed_mps and steering_rad, (2,).
+        clock: a `Clock`.
     """
+    step, steps, dt_s = clock
+    speed_mps, steering_rad = command[0], command[1]
     arrived = min(max(step + 1 - car.speed_delay * steps, 0.0), 1.0)
     drive.sent_speed_mps += arrived * (speed_mps - drive.sent_speed_mps)
     arrived = min(max(step + 1 - car.steering_delay * steps, 0.0), 1.0)
@@ -221,27 +233,26 @@ def send(car, drive, speed_mps, steering_rad, step, steps, dt_s):  # type: ignor
 
 
 @njit(cache=True, error_model="numpy")
-def push_cars(cars, drives, yaw_rad, velocity, commands, step, steps, dt_s, forces):  # type: ignore[no-untyped-def]
+def push_cars(cars, drives, motion, commands, clock, forces):  # type: ignore[no-untyped-def]
     """Compute the forces on all cars for one physics step of a control period.
 
     Args:
         cars: `CAR` records, (N,).
         drives: `DRIVE` records, changed in place, (N, 1).
-        yaw_rad: headings, (N,).
-        velocity: of the centres of mass in the world, m/s, m/s and rad/s, (N, 3).
+        motion: headings in radians, (N,), and velocities of the centres of mass in the world, (N, 3), in m/s, m/s and
+            rad/s.
         commands: commanded speed_mps and steering_rad, (N, 2).
-        step: number of the physics step in the control period, from 0.
-        steps: physics steps in a control period.
-        dt_s: length of a physics step.
+        clock: a `Clock`.
         forces: written: force in the world, N, N, and torque, N m, (N, 3).
     """
+    yaw_rad, velocity = motion
     for n in range(len(cars)):
         car, drive = cars[n], drives[n, 0]
-        send(car, drive, commands[n, 0], commands[n, 1], step, steps, dt_s)
+        send(car, drive, commands[n], clock)
         cos, sin = np.cos(yaw_rad[n]), np.sin(yaw_rad[n])
         vx, vy = velocity[n, 0], velocity[n, 1]
         ahead_n, left_n, torque_nm = tyre_forces(
-            car, drive, cos * vx + sin * vy, cos * vy - sin * vx, velocity[n, 2], dt_s
+            car, drive, cos * vx + sin * vy, cos * vy - sin * vx, velocity[n, 2], clock.dt_s
         )
         forces[n, 0] = cos * ahead_n - sin * left_n
         forces[n, 1] = sin * ahead_n + cos * left_n

@@ -19,7 +19,7 @@ def driven(car, friction, given):
     cars, drive, states = one_car(car, friction), drive_record(), [standing(car, 1.0, 2.0, 0.5)]
     for command in given:
         after = np.empty_like(states[-1])
-        advance(cars, drive, states[-1], command, car.substeps, car.control_period_s / car.substeps, after)
+        advance(cars, drive, states[-1], command, (car.substeps, car.control_period_s / car.substeps), after)
         states.append(after)
     return np.array(states)
 
@@ -46,7 +46,7 @@ def test_derivatives_predict_where_a_changed_command_leads_to():
     by_state, by_command = np.empty((PERIODS, 15, 15)), np.empty((PERIODS, 15, 2))
     step_s = car.control_period_s / car.substeps
     linearise(
-        one_car(car, 1.0), drive_record(), states[:-1], given, car.substeps, step_s, by_state, by_command
+        one_car(car, 1.0), drive_record(), states[:-1], given, (car.substeps, step_s), (by_state, by_command)
     )
     changed, change = given.copy(), np.array([1e-4, 1e-5])
     changed[20] += change
