@@ -107,13 +107,9 @@ class _Road:
 
     def time_s(self, offsets: Floats) -> float:
         """Return the least time on a line."""
-        ability = self._ability
-        return float(
-            _time_s(
-                self.line(offsets), -ability.curvature_per_m, ability.speed_mps, ability.accelerate_mps2,
-                ability.brake_mps2, self._flying, self._short_m,
-            )
-        )  # fmt: skip
+        can = self._ability
+        ability = (-can.curvature_per_m, can.speed_mps, can.accelerate_mps2, can.brake_mps2)
+        return float(_time_s(self.line(offsets), ability, self._flying, self._short_m))
 
     def improved(self, offsets: Floats) -> tuple[float, Floats]:
         """Return the least time on a line near by, and its offsets."""
@@ -200,7 +196,8 @@ def curvature_per_m(even, window):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _time_s(points, minus_curvature, speed, accelerate, brake, flying, short_m):  # type: ignore[no-untyped-def]
+def _time_s(points, ability, flying, short_m):  # type: ignore[no-untyped-def]
+    minus_curvature, speed, accelerate, brake = ability
     if flying:  # three times around, of which the middle one counts
         once = len(points) - 1
         long = np.empty((3 * once + 1, 2))

@@ -114,9 +114,11 @@ def build_segments(vertices: np.ndarray) -> Segments:
     vertex["length_m"][:-1], vertex["heading_rad"][:-1] = length_m, np.arctan2(dy, dx)
     every = np.arange(len(length_m))
     columns_c, rows_c = -(-columns // SPLIT), -(-rows // SPLIT)
-    whole = (np.array([0, len(every)]), every, 1, SPLIT * max(columns, rows))
-    coarse = _candidates(vertex, low_x, low_y, cell_m * SPLIT, columns_c, rows_c, *whole)
-    first, member = _candidates(vertex, low_x, low_y, cell_m, columns, rows, *coarse, columns_c, SPLIT)
+    whole = _Cells(np.array([0, len(every)]), every, 1)
+    grid = (low_x, low_y, cell_m * SPLIT, columns_c, rows_c)
+    first, member = _candidates(vertex, grid, whole, SPLIT * max(columns, rows))
+    coarse = _Cells(first, member, columns_c)
+    first, member = _candidates(vertex, (low_x, low_y, cell_m, columns, rows), coarse, SPLIT)
     line = np.zeros(1, LINE)
     line["segments"], line["points"], line["total_m"] = len(length_m), len(vertices), start_m[-1]
     line["buckets"] = len(bucket)
@@ -232,10 +234,21 @@ def squared_distance(a, b, px, py):  # type: ignore[no-untyped-def]
     return squared, fraction
 
 
+class _Cells(NamedTuple):
+    """The candidates of a grid's cells, as in `Segments`."""
+
+    first: np.ndarray
+    member: np.ndarray
+    columns: int
+
+
 @compiled
-def _candidates(  # type: ignore[no-untyped-def]
-    vertices, low_x, low_y, cell_m, columns, rows, parent_first, parent_member, parent_columns, split
-):
+def _candidates(vertices, grid, cells, split):  # type: ignore[no-untyped-def]
+    """Return `first` and `member` of a grid's cells, whose candidates are among those of a cell `split` times as large.
+
+    `grid` is the lowest x and y, the side of a cell, and the numbers of columns and rows.
+    """
+    low_x, low_y, cell_m, columns, rows = grid
     reach = math.sqrt(2.0) * cell_m + 1e-9
     first = np.zeros(columns * rows + 1, np.int64)
     member = np.empty(4 * columns * rows + len(vertices), np.int64)
@@ -244,11 +257,11 @@ def _candidates(  # type: ignore[no-untyped-def]
     for row in range(rows):
         for column in range(columns):
             px, py = low_x + (column + 0.5) * cell_m, low_y + (row + 0.5) * cell_m
-            parent = (row // split) * parent_columns + column // split
-            begin, end = parent_first[parent], parent_first[parent + 1]
+            parent = (row // split) * cells.columns + column // split
+            begin, end = cells.first[parent], cells.first[parent + 1]
             nearest = np.inf
             for k in range(begin, end):
-                row_k = parent_member[k]
+                row_k = cells.member[k]
                 d = math.sqrt(squared_distance(vertices[row_k], vertices[row_k + 1], px, py)[0])
                 distance[k - begin] = d
                 nearest = min(nearest, d)
@@ -258,7 +271,7 @@ def _candidates(  # type: ignore[no-untyped-def]
                         longer = np.empty(2 * used, np.int64)
                         longer[:used] = member
                         member = longer
-                    member[used] = parent_member[k]
+                    member[used] = cells.member[k]
                     used += 1
             first[row * columns + column + 1] = used
     return first, member[:used].copy()
