@@ -248,7 +248,7 @@ def push_cars(cars, drives, motion, commands, clock, forces):  # type: ignore[no
     yaw_rad, velocity = motion
     for n in range(len(cars)):
         car, drive = cars[n], drives[n, 0]
-        send(car, drive, commands[n], clock)
+        send(car, drive, (commands[n, 0], commands[n, 1]), clock)
         cos, sin = np.cos(yaw_rad[n]), np.sin(yaw_rad[n])
         vx, vy = velocity[n, 0], velocity[n, 1]
         ahead_n, left_n, torque_nm = tyre_forces(
