@@ -95,18 +95,16 @@ def _import(args: argparse.Namespace) -> int:
     from deepracer_exp.config.compose import compose_experiment
     from deepracer_exp.config.custom_files import KEY, read_custom_files
     from deepracer_exp.config.imported_options import import_files
-    from deepracer_exp.config.job_overrides import job_overrides, several_of
     from deepracer_exp.config.overrides import override_line
     from deepracer_exp.training.plan import plan_training
 
     files = read_custom_files(args.path)
     plan = plan_training(*compose_experiment([override_line(KEY, args.path)]))
     written = import_files(files, args.name, plan.composition.mapping)
-    beside = shlex.join(line.replace("'", "") for line in several_of(job_overrides(files.workers, {})[0]))
     print_notes((*plan.composition.notes, *plan.files.remarks))
     for path in written:
         print(path)
-    print(f"\n  train it  deepracer-exp train experiment={args.name} {beside}".rstrip())
+    print(f"\n  train it  deepracer-exp train experiment={args.name}")
     return 0
 
 

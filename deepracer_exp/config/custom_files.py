@@ -1,7 +1,6 @@
 """The files of a DeepRacer model and of deepracer-for-cloud, read from a folder (`custom_files=DIR`)."""
 
 import os
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import Any, NamedTuple
 
 from deepracer_exp.aws.models import hyperparameters, model_metadata
 from deepracer_exp.aws.models.hyperparameters import Hyperparameters, read_hyperparameters
-from deepracer_exp.aws.models.job_settings import JobSettings, read_run_env, read_training_params
+from deepracer_exp.aws.models.job_settings import JobSettings, read_run_env
 from deepracer_exp.aws.models.model_metadata import (
     LIDARS,
     NEURAL_NETWORKS,
@@ -27,7 +26,6 @@ PLACES = {
     "model_metadata.json": ("", "custom_files/", "model/"),
     "hyperparameters.json": ("", "custom_files/", "ip/"),
     "run.env": ("",),
-    "training_params.yaml": ("",),
 }
 """Folders in which each file is: of deepracer-for-cloud, of one of its `experiments/`, or of a trained model."""
 
@@ -107,12 +105,12 @@ class CustomFiles:
     """Paths of the files found, by their names in PLACES."""
     metadata: ModelMetadata | None
     hyperparameters: Hyperparameters | None
-    workers: tuple[JobSettings, ...] = ()
-    """Track, starts and race type of each simulation worker, from run.env or training_params.yaml; empty without."""
+    job: JobSettings | None = None
+    """Track, starts and race of run.env; None without."""
     left: Mapping[str, "Left"] = field(default_factory=dict)
     """What is not used of files with similar names, by the name in PLACES."""
     unused: tuple[str, ...] = ()
-    """A line for each other file of deepracer-for-cloud that is not used, with the reason."""
+    """A line for each folder `experiments/NAME` of deepracer-for-cloud, none of which is used."""
 
     @property
     def name(self) -> str:
@@ -265,11 +263,12 @@ def read_custom_files(folder: str) -> CustomFiles:
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise BadInput(f"{KEY} {folder}", f"cannot be read ({reason})", accepted) from error
-    workers, unused = _workers(folder, names)
+    unused = _experiments(folder)
+    job = read_run_env(str(Path(folder, "run.env"))) if "run.env" in names else None
     paths, left = {}, {}
     for name, places in PLACES.items():
         # run.env may choose another file by its name.
-        wanted = workers[0].files.get(name, name) if workers else name
+        wanted = job.files.get(name, name) if job else name
         exact = [Path(folder, place, wanted) for place in places]
         similar = [
             path for place in places for path in sorted(Path(folder, place).glob(SIMILAR.get(name, name)))
@@ -295,35 +294,20 @@ def read_custom_files(folder: str) -> CustomFiles:
         paths,
         read_model_metadata(metadata) if metadata else None,
         read_hyperparameters(learning) if learning else None,
-        workers,
+        job,
         left,
         tuple(unused),
     )
 
 
-def _workers(folder: str, names: Sequence[str]) -> tuple[tuple[JobSettings, ...], list[str]]:
-    """Return the settings of each simulation worker, and a line for each file of such settings that is not used."""
-    numbered = {int(match[1]): name for name in names if (match := re.fullmatch(r"worker-(\d+)\.env", name))}
+def _experiments(folder: str) -> list[str]:
+    """Return a line for each folder `experiments/NAME`, which is trained by its own name."""
     unused = []
-    if "run.env" in names:
-        others = {number: str(Path(folder, name)) for number, name in numbered.items()}
-        workers = read_run_env(str(Path(folder, "run.env")), others)
-        if not workers[0].has_several:
-            unused += [
-                f"{name}: not used, because run.env does not say DR_TRAIN_MULTI_CONFIG=True"
-                for name in numbered.values()
-            ]
-        if "training_params.yaml" in names:
-            unused.append("training_params.yaml: not used, because of run.env")
-    else:
-        params = str(Path(folder, "training_params.yaml"))
-        workers = read_training_params(params) if "training_params.yaml" in names else ()
-        unused += [f"{name}: not used, because there is no run.env beside it" for name in numbered.values()]
     for path in sorted(Path(folder).glob("experiments/*/")):
         # A folder's name may contain line breaks.
         shown = " ".join(str(path).split())
         unused.append(f"experiments/{' '.join(path.name.split())}: not used; {KEY}={shown} trains it")
-    return workers, unused
+    return unused
 
 
 def _unknown(keys: Iterable[str], used: Iterable[str]) -> Iterable[tuple[str, str]]:

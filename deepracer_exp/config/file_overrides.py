@@ -90,7 +90,7 @@ def file_overrides(files: CustomFiles, typed: Mapping[str, str]) -> FileOverride
             "hyperparameters.json" if files.hyperparameters else "model_metadata.json: training_algorithm=sac"
         )
         notes.append(f"{source}: used as {', '.join(taken)}")
-    job, applied = job_overrides(files.workers, typed)
+    job, applied = job_overrides(files.job, typed) if files.job else ([], [])
     notes += [*applied, *_left(files, typed)]
     return FileOverrides(tuple([*lines, *job]), names, (*notes, *files.remarks()))
 

@@ -15,9 +15,10 @@ from deepracer_exp.files import read_bytes
 
 from .custom_files import FRAMES, CustomFiles
 from .experiment import safe_name
-from .job_overrides import job_overrides, several_of
+from .file_overrides import car_override
+from .job_overrides import job_overrides
 from .options import conf_dirs
-from .overrides import override_line, parse_single
+from .overrides import parse_single
 
 _GROUPS = {
     "reward_function.py": "reward",
@@ -32,11 +33,8 @@ def import_files(
     mapping: Mapping[str, Any],
     more: Sequence[str] = (),
     source: str | None = None,
-    typed: Mapping[str, str] | None = None,
 ) -> list[Path]:
     """Write and return `./conf/GROUP/NAME.yaml` for each file and, last, `./conf/experiment/NAME.yaml` for all of them.
-
-    Several tracks are left out, because no option file can choose them (`job_overrides.several_of`).
 
     Args:
         files: the files of a folder.
@@ -44,7 +42,6 @@ def import_files(
         mapping: the experiment that the files describe, validated.
         more: overrides that belong to the experiment, too.
         source: where the files come from, if their folder is a temporary one.
-        typed: the user's own overrides by key or group, in whose place none is written.
 
     Raises:
         BadInput: the name cannot be used or is taken, or a file cannot be written; then none is.
@@ -68,10 +65,8 @@ def import_files(
     }
     if files.is_sac and "algorithm" not in imported.values():
         experiment["defaults"].append({"override /algorithm": "sac"})
-    job, _ = job_overrides(files.workers, typed or {})
-    lines = [*([override_line("car", files.car)] if files.car else ()), *job, *more]
-    left_out = several_of(job)
-    for override in map(parse_single, (line for line in lines if line not in left_out)):
+    job = job_overrides(files.job, {})[0] if files.job else ()
+    for override in map(parse_single, (*car_override(files, {})[0], *job, *more)):
         group, _, key = override.key_or_group.partition(".")
         if key:
             *above, leaf = group, *key.split(".")

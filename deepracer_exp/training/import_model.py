@@ -1,6 +1,5 @@
 """A model that was trained with the service, as a run of our own."""
 
-import shlex
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -18,6 +17,7 @@ from deepracer_exp.agents.service_weights import (
     policy_of_sac,
 )
 from deepracer_exp.aws.models.archive import StoredModel, Tensors, read_model
+from deepracer_exp.aws.models.job_settings import read_training_params
 from deepracer_exp.aws.models.model_metadata import NEURAL_NETWORKS, ModelMetadata
 from deepracer_exp.config.compose import Composition, compose_experiment, compose_option
 from deepracer_exp.config.custom_files import (
@@ -33,7 +33,7 @@ from deepracer_exp.config.custom_files import (
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.file_overrides import car_override
 from deepracer_exp.config.imported_options import import_files, remove_options
-from deepracer_exp.config.job_overrides import job_overrides, several_of
+from deepracer_exp.config.job_overrides import job_overrides
 from deepracer_exp.config.learning import CNNConfig, SACConfig
 from deepracer_exp.config.overrides import key_of, override_line
 from deepracer_exp.env.action_space import build_action_space
@@ -45,6 +45,8 @@ from .plan import plan_training
 from .run import store_run
 
 _CHECKPOINT = "checkpoint="
+_PARAMS = "training_params.yaml"
+"""The file of a trained model that says on which track and against whom the service trained it."""
 _CHOSEN_HERE = ("sensor", "neural_network", "lidar_config")
 """Keys of model_metadata.json that have no effect where only options are made of the files."""
 
@@ -78,7 +80,7 @@ def import_model(path: str, name: str, overrides: Sequence[str]) -> Imported:
         raise BadInput(f"checkpoint={wanted}", "", "best, last (of the service's deepracer_checkpoints.json)")
     model = read_model(path, wanted)
     with tempfile.TemporaryDirectory() as aside:
-        for file in PLACES:
+        for file in (*PLACES, _PARAMS):
             if file in model.files:
                 Path(aside, file).write_bytes(model.files[file])
         try:
@@ -95,29 +97,29 @@ def _import(model: StoredModel, path: str, aside: str, name: str, changes: Seque
     files = read_custom_files(aside)
     assert files.metadata is not None
     seen = sensor_overrides(files.metadata)
-    experiment, composition, networks, network, absent = _fit(model, files, seen, name, changes)
+    params = read_training_params(str(Path(aside, _PARAMS))) if _PARAMS in model.files else None
+    typed = {key_of(line): line for line in (*seen, *changes)}
+    job, applied = job_overrides(params, typed) if params else ([], [])
+    experiment, composition, networks, network, absent = _fit(model, files, [*job, *seen], name, changes)
     load_reward_source(experiment.reward)
-    by_key = {key_of(line): line for line in changes}
-    options = import_files(files, name, composition.mapping, [*network, *seen], path, by_key)
-    # No option file can choose several tracks, so that the experiment has none of them.
-    job, of_job = job_overrides(files.workers, by_key)
-    several, applied = several_of(job), [*car_override(files, by_key)[1], *of_job]
+    options = import_files(files, name, composition.mapping, [*job, *network, *seen], path)
     try:
-        experiment, composition = compose_experiment([f"experiment={name}", *several, *changes])
+        experiment, composition = compose_experiment([f"experiment={name}", *changes])
         result = store_run(plan_training(experiment, composition), networks, f"imported from {model.source}")
     except BaseException:
         remove_options(options)
         raise
     notes = [f"{model.source}: {', '.join([*seen, *network])}", *model.notes]
-    if several:
-        beside = shlex.join(line.replace("'", "") for line in several)
-        notes.append(f"experiment={name} has the default track: give its tracks beside it, {beside}")
-    notes = list(dict.fromkeys([*notes, *_remarks(files, model, absent), *applied]))
-    return Imported(result.folder, options, notes, model.has_logs)
+    if params is None or params.world is None:
+        notes.append(
+            "the track of the training is not known: the default is used; track=NAME chooses another"
+        )
+    notes += [*_remarks(files, model, absent), *car_override(files, typed)[1], *applied]
+    return Imported(result.folder, options, list(dict.fromkeys(notes)), model.has_logs)
 
 
 def _fit(
-    model: StoredModel, files: CustomFiles, seen: Sequence[str], name: str, changes: Sequence[str]
+    model: StoredModel, files: CustomFiles, lines: Sequence[str], name: str, changes: Sequence[str]
 ) -> tuple[Experiment, Composition, PolicyNetworks, list[str], list[str]]:
     """Return the experiment with that network of the service that the weights belong to, and what is absent."""
     metadata, refused = files.metadata, None
@@ -129,8 +131,8 @@ def _fit(
             option, _ = services_network(replace(metadata, neural_network=kind))
             hidden = [*compose_option("network", option, CNNConfig).hidden, SAC_HIDDEN]
             network.append(override_line("network.hidden", hidden))
-        lines = [override_line(KEY, files.folder), *seen, *network, override_line("name", name), *changes]
-        experiment, composition = compose_experiment(lines)
+        described = [override_line(KEY, files.folder), *lines, *network, override_line("name", name)]
+        experiment, composition = compose_experiment([*described, *changes])
         if not isinstance(experiment.network, CNNConfig):
             raise BadInput("network", "the weights are of a network of the service; leave network= off")
         if isinstance(experiment.algorithm, SACConfig) != files.is_sac:
@@ -190,9 +192,5 @@ def _remarks(files: CustomFiles, model: StoredModel, absent: Sequence[str]) -> l
     if "reward_function.py" not in model.files:
         notes.append(
             "reward_function.py: not among the files; clones learn from the default reward unless given reward="
-        )
-    if not any(worker.world for worker in files.workers):
-        notes.append(
-            "the track of the training is not known: the default is used; track=NAME chooses another"
         )
     return notes

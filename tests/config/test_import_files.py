@@ -1,5 +1,4 @@
 import dataclasses
-import shlex
 from functools import cache
 from pathlib import Path
 
@@ -68,16 +67,6 @@ def test_an_imported_experiment_has_the_track_the_starts_and_the_car_of_the_file
     assert (imported.track, imported.episode, imported.car) == (files.track, files.episode, files.car)
     assert (composition.choices["track"], composition.choices["car"]) == ("Bowtie_track", "deepracer_v4")
     assert (imported.track.direction, imported.episode.start_advance) == ("reversed", 0.0)
-
-
-def test_several_tracks_are_given_beside_an_imported_experiment(custom_files, call_at, here):
-    folder = custom_files()
-    (folder / "training_params.yaml").write_text("WORLD_NAME: [Oval_track, Bowtie_track]\n")
-    ended = call_at(here, "import", str(folder), "--name", "mine")
-    assert ended.code == 0, ended.stderr
-    words = shlex.split(ended.stdout.partition("deepracer-exp train ")[2])
-    assert words == ["experiment=mine", "track=[Oval_track,Bowtie_track]"]
-    assert list(compose_experiment(["experiment=mine"])[0].tracks) == ["reinvent_base"]
 
 
 def test_an_imported_option_combines_with_others(custom_files):

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from deepracer_exp.aws.models.job_settings import race_values
+from deepracer_exp.aws.models.job_settings import race_values, read_training_params
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.job_overrides import job_overrides
 from deepracer_exp.config.job_race import recorded_race
 from tests.conftest import refused
 
@@ -82,7 +83,9 @@ def test_in_training_params_numbers_decide_whatever_the_type_and_both_may_be_the
         "OBSTACLE_TYPE": "amazon_box_obstacle",
         "IS_OBSTACLE_BOT_CAR": "true",
     }
-    experiment, notes = composed(job("training_params.yaml", values))
+    params = read_training_params(str(job("training_params.yaml", values) / "training_params.yaml"))
+    lines, notes = job_overrides(params, {})
+    experiment, _ = compose_experiment(lines)
     assert [box.lap for box in experiment.race.boxes.positions] == [0.1, 0.25]
     assert (experiment.race.bots.number, experiment.race.bots.lane_change_after_s) == (1, None)
     assert any("OBSTACLE_TYPE=amazon_box_obstacle: not applied" in note for note in notes)

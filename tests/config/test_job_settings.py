@@ -1,12 +1,14 @@
-"""run.env, worker-N.env, experiments/NAME and training_params.yaml of deepracer-for-cloud and of a model."""
+"""run.env and experiments/NAME of deepracer-for-cloud, and training_params.yaml of a trained model."""
 
 import re
 from pathlib import Path
 
 import pytest
 
+from deepracer_exp.aws.models.job_settings import read_training_params
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.custom_files import read_custom_files
+from deepracer_exp.config.job_overrides import job_overrides
 from deepracer_exp.errors import BadInput
 
 from .conftest import METADATA, REWARD
@@ -41,16 +43,14 @@ RUN_ENV = {
 
 @pytest.fixture
 def drfc(tmp_path, custom_files):
-    """Write a folder of deepracer-for-cloud: its three files, run.env, and worker-N.env by N."""
+    """Write a folder of deepracer-for-cloud: its three files and run.env."""
 
-    def write(run_env: dict[str, str | None], folder: str = "drfc", **workers: dict[str, str]) -> Path:
+    def write(run_env: dict[str, str], folder: str = "drfc") -> Path:
         path = tmp_path / folder
         path.mkdir(parents=True, exist_ok=True)
         custom_files(folder=f"{folder}/custom_files")
-        for name, values in {"run": RUN_ENV | run_env, **workers}.items():
-            lines = [f"{key}={value}" for key, value in values.items() if value is not None]
-            text = "\n".join(["# of deepracer-for-cloud", "", *lines])
-            (path / f"{name.replace('_', '-')}.env").write_text(text)
+        lines = [f"{key}={value}" for key, value in (RUN_ENV | run_env).items()]
+        (path / "run.env").write_text("\n".join(["# of deepracer-for-cloud", "", *lines]))
         return path
 
     return write
@@ -123,46 +123,6 @@ def test_what_decides_and_is_not_applied_is_named(drfc, key, value, word):
     assert word in note
 
 
-def test_workers_with_files_of_their_own_are_several_tracks(drfc):
-    folder = drfc(
-        {"DR_TRAIN_MULTI_CONFIG": "True", "DR_TRAIN_ALTERNATE_DRIVING_DIRECTION": "True"},
-        worker_2={"DR_WORLD_NAME": "Bowtie_track", "DR_TRAIN_ALTERNATE_DRIVING_DIRECTION": "False"},
-        worker_3={"DR_TRAIN_REVERSE_DIRECTION": "True", "DR_RACE_TYPE": "HEAD_TO_BOT"},
-        # A number between is missing: what worker-3 has holds on.
-        worker_5={"DR_WORLD_NAME": "2022_april_open", "DR_TRAIN_START_POSITION_OFFSET": "0.5"},
-    )
-    experiment, notes = composed(folder)
-    tracks = {name: (track.direction, track.weight) for name, track in experiment.tracks.items()}
-    assert tracks == {
-        "Oval_track": ("alternate", 1.0),
-        # Forward and reversed.
-        "Bowtie_track": ("alternate", 2.0),
-        "2022_april_open": ("reversed", 1.0),
-    }
-    assert "worker-5.env: starts: not applied: all cars start as those of run.env" in notes
-    assert any(
-        note.startswith("worker-3.env: DR_RACE_TYPE and boxes or bots: not applied: all cars race as those")
-        for note in notes
-    )
-    # The user's own values have priority, of one track and of all.
-    experiment, notes = composed(folder, "track=Oval_track", "track.direction=reversed")
-    assert {name: track.direction for name, track in experiment.tracks.items()} == {"Oval_track": "reversed"}
-    assert any("track and direction: not used, because of track=Oval_track" in note for note in notes)
-    experiment, _ = composed(folder, "track.direction=forward", "track.Oval_track.weight=3")
-    assert [(track.direction, track.weight) for track in experiment.tracks.values()] == [
-        ("forward", 3.0),
-        ("forward", 2.0),
-        ("forward", 1.0),
-    ]
-
-
-def test_files_of_workers_count_only_where_run_env_says_so(drfc):
-    folder = drfc({}, worker_2={"DR_WORLD_NAME": "Bowtie_track"})
-    experiment, notes = composed(folder)
-    assert list(experiment.tracks) == ["Oval_track"]
-    assert "worker-2.env: not used, because run.env does not say DR_TRAIN_MULTI_CONFIG=True" in notes
-
-
 def test_an_experiment_of_deepracer_for_cloud_is_a_folder_and_others_are_named(drfc):
     root = drfc({})
     drfc({"DR_WORLD_NAME": "Bowtie_track"}, "drfc/experiments/sprint-v1")
@@ -232,26 +192,51 @@ def test_a_line_that_is_none_is_named_and_a_track_beside_it_is_taken(drfc):
 
 
 @pytest.mark.parametrize(
-    ("text", "tracks"),
+    ("text", "lines"),
     [
-        ("WORLD_NAME: Oval_track\nREVERSE_DIR: true\n", {"Oval_track": "reversed"}),
-        ("WORLD_NAME: ['Oval_track']\nREVERSE_DIR: 'False'\n", {"Oval_track": "forward"}),
+        ("WORLD_NAME: Oval_track\nREVERSE_DIR: true\n", ["track='Oval_track'", "track.direction='reversed'"]),
         (
-            "WORLD_NAME: [Oval_track, Bowtie_track]\nREVERSE_DIR: [false, true]\n",
-            {"Oval_track": "forward", "Bowtie_track": "reversed"},
+            "WORLD_NAME: ['Oval_track']\nREVERSE_DIR: 'False'\n",
+            ["track='Oval_track'", "track.direction='forward'"],
         ),
         # deepracer-on-aws: the world's name and the direction, of which some worlds have one each.
-        ("WORLD_NAME: 2022_april_open\nTRACK_DIRECTION_CLOCKWISE: true\n", {"2022_april_open_cw": "forward"}),
-        ("WORLD_NAME: Oval_track\nTRACK_DIRECTION_CLOCKWISE: true\n", {"Oval_track": "reversed"}),
-        ("WORLD_NAME: Oval_track\nTRACK_DIRECTION_CLOCKWISE: false\n", {"Oval_track": "forward"}),
+        (
+            "WORLD_NAME: 2022_april_open\nTRACK_DIRECTION_CLOCKWISE: true\n",
+            ["track='2022_april_open_cw'", "track.direction='forward'"],
+        ),
+        (
+            "WORLD_NAME: Oval_track\nTRACK_DIRECTION_CLOCKWISE: true\n",
+            ["track='Oval_track'", "track.direction='reversed'"],
+        ),
+        (
+            "WORLD_NAME: Oval_track\nTRACK_DIRECTION_CLOCKWISE: false\n",
+            ["track='Oval_track'", "track.direction='forward'"],
+        ),
     ],
 )
-def test_the_parameters_of_a_models_training_say_where_it_was(custom_files, text, tracks):
+def test_the_parameters_of_a_trained_model_say_where_it_was(tmp_path, text, lines):
+    (tmp_path / "training_params.yaml").write_text(text)
+    found, notes = job_overrides(read_training_params(str(tmp_path / "training_params.yaml")), {})
+    assert found == lines
+    shown = ", ".join(lines).replace("'", "")
+    assert notes == [f"training_params.yaml: used as {shown}"]
+
+
+def test_of_several_workers_the_first_counts_and_the_others_are_named(tmp_path, drfc):
+    text = "WORLD_NAME: [Oval_track, Bowtie_track]\nREVERSE_DIR: [true, false]\n"
+    (tmp_path / "training_params.yaml").write_text(text)
+    lines, notes = job_overrides(read_training_params(str(tmp_path / "training_params.yaml")), {})
+    assert lines == ["track='Oval_track'", "track.direction='reversed'"]
+    more = "further workers: not applied: track=[A,B] trains on several tracks"
+    assert notes[1:] == [f"training_params.yaml: {more}"]
+    _, notes = composed(drfc({"DR_TRAIN_MULTI_CONFIG": "True"}))
+    assert f"run.env: {more}" in notes
+
+
+def test_the_parameters_of_a_trained_model_are_none_of_its_custom_files(custom_files):
     folder = custom_files()
-    (folder / "training_params.yaml").write_text(text)
-    experiment, notes = composed(folder)
-    assert {name: track.direction for name, track in experiment.tracks.items()} == tracks
-    assert any(note.startswith("training_params.yaml: used as track=") for note in notes)
+    (folder / "training_params.yaml").write_text("WORLD_NAME: Oval_track\n")
+    assert composed(folder)[0].track.name == "reinvent_base"
 
 
 # --- Files under other names

@@ -181,29 +181,21 @@ def test_a_frozen_policy_of_sac_has_fresh_deviations_and_another_head_is_named(s
         policy_of_sac(to_service(soft, SENSORS), "model.pb")
 
 
-def test_a_model_of_several_tracks_is_a_run_on_all_of_them(call, tmp_path, weights):
-    settings = b"WORLD_NAME: [Oval_track, Bowtie_track]\nREVERSE_DIR: ['False', 'True']\n"
+def test_a_model_of_several_tracks_is_a_run_on_the_first_unless_others_are_given(call, tmp_path, weights):
+    settings = b"WORLD_NAME: [Oval_track, Bowtie_track]\nREVERSE_DIR: ['True', 'False']\n"
     files = files_of(weights) | {"training_params.yaml": settings}
     write_folder(tmp_path / "sent", files)
     ended = call("import", "sent", "--name", "mine", "tracking=off")
     assert ended.code == 0, ended.stderr
     tracks = StoredRun(ended.folder).experiment.tracks
-    assert {name: track.direction for name, track in tracks.items()} == {
-        "Oval_track": "forward",
-        "Bowtie_track": "reversed",
-    }
-    (used,) = [
-        line for line in ended.stderr.splitlines() if "used as track=[Oval_track,Bowtie_track]" in line
-    ]
-    (beside,) = [line for line in ended.stderr.splitlines() if "give its tracks beside it" in line]
-    assert used.startswith("training_params.yaml")
-    words = beside.partition("beside it, ")[2].split()
-    given = [word.strip("'") for word in words]
-    assert compose_experiment(given)[0].tracks == tracks
-    again = call("import", "sent", "--name", "other", "tracking=off", "track=Oval_track")
+    assert {name: track.direction for name, track in tracks.items()} == {"Oval_track": "reversed"}
+    more = "training_params.yaml: further workers: not applied: track=[A,B] trains on several tracks"
+    assert more in ended.stderr
+    both = "track=[Oval_track,Bowtie_track]"
+    again = call("import", "sent", "--name", "other", "tracking=off", both)
     assert again.code == 0, again.stderr
     (folder,) = (tmp_path / "runs" / "other").iterdir()
-    assert list(StoredRun(folder).experiment.tracks) == ["Oval_track"]
+    assert list(StoredRun(folder).experiment.tracks) == ["Oval_track", "Bowtie_track"]
 
 
 @pytest.mark.parametrize("pack", [tar_of, zip_of, None], ids=["tar.gz", "zip", "folder"])

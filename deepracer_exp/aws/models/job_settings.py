@@ -1,8 +1,8 @@
-"""run.env, worker-N.env and training_params.yaml: where, from which starts and against whom the service trains."""
+"""run.env and training_params.yaml: where, from which starts and against whom the service trains."""
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from deepracer_exp.errors import BadInput, nearest
@@ -57,7 +57,7 @@ _TRUE, _FALSE = ("true", "t", "yes", "y", "on", "1"), ("false", "f", "no", "n", 
 
 @dataclass(frozen=True, kw_only=True)
 class JobSettings:
-    """The task of one simulation worker of the service; None where the file does not say."""
+    """The task of the first simulation worker of the service; None where the file does not say."""
 
     file: str
     """Path of the file."""
@@ -78,7 +78,7 @@ class JobSettings:
     """Share of the lap at which the first episode starts."""
     randomizes: bool
     has_several: bool
-    """Whether each worker has a file of its own (run.env)."""
+    """Whether further workers have settings of their own."""
     is_pretrained: bool
     """Whether the training continues that of another model (run.env)."""
     is_env: bool
@@ -94,32 +94,20 @@ class JobSettings:
         return Path(self.file).name
 
 
-def read_run_env(path: str, workers: Mapping[int, str]) -> tuple[JobSettings, ...]:
-    """Read deepracer-for-cloud's run.env, and the worker-N.env that hold for its further workers.
-
-    `workers` are the paths of worker-N.env by N, which count if run.env says that workers differ.
-
-    A worker's file has what differs from the worker before it.
+def read_run_env(path: str) -> JobSettings:
+    """Read deepracer-for-cloud's run.env.
 
     Raises:
-        BadInput: a file cannot be read or has a value that the service does not accept.
+        BadInput: the file cannot be read or has a value that the service does not accept.
 
     Source of the rules: deepracer-for-cloud, scripts/training/prepare-config.py.
     """
     values = _read_env(path)
-    first = _settings(path, values, ENV_KEYS, tuple(values))
-    if not first.has_several:
-        return (first,)
-    settings = [first]
-    for number in sorted(workers):
-        worker = _read_env(workers[number])
-        values = values | worker
-        settings.append(_settings(workers[number], values, ENV_KEYS, tuple(worker)))
-    return tuple(settings)
+    return _settings(path, values, ENV_KEYS, tuple(values))
 
 
-def read_training_params(path: str) -> tuple[JobSettings, ...]:
-    """Read the training_params.yaml of a model, in which a key has one value, or one for each worker.
+def read_training_params(path: str) -> JobSettings:
+    """Read the training_params.yaml of a trained model; of a list with a value for each worker the first counts.
 
     Raises:
         BadInput: as for `read_run_env`.
@@ -129,23 +117,10 @@ def read_training_params(path: str) -> tuple[JobSettings, ...]:
     if not isinstance(data, dict):
         raise BadInput(path, "holds no keys", accepted)
     lists = {str(key): value if isinstance(value, list) else [value] for key, value in data.items()}
-    positions = lists.get("OBJECT_POSITIONS")
-    if positions is not None:  # a list already, or one of lists
-        each = positions if any(isinstance(value, list) for value in positions) else [positions]
-        lists["OBJECT_POSITIONS"] = [
-            ";".join(map(str, value if isinstance(value, list) else [value])) for value in each
-        ]
-    workers = max(len(lists.get(key, ())) for key in ENV_KEYS)
-    same = {key: key for key in ENV_KEYS}
-    return tuple(
-        _settings(
-            path,
-            {key: str(value[min(k, len(value) - 1)]) for key, value in lists.items() if value},
-            same,
-            tuple(lists),
-        )
-        for k in range(max(1, workers))
-    )
+    values = {key: str(value[0]) for key, value in lists.items() if value and value[0] is not None}
+    several = any(len(lists.get(key, ())) > 1 for key in ENV_KEYS)
+    settings = _settings(path, values | race_values(data), {key: key for key in ENV_KEYS}, tuple(lists))
+    return replace(settings, has_several=several)
 
 
 def race_values(params: Mapping[object, object]) -> dict[str, str]:
