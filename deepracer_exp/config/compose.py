@@ -173,7 +173,7 @@ def _choice(override: Override) -> str:
 
 
 def compose_option(group: str, option: str, kind: type[Config]) -> Config:
-    """Compose and validate a single option, in a quarter of the time of an experiment.
+    """Compose and validate a single option.
 
     Raises:
         BadInput: there is no such option, its values are not accepted, or they refer to other groups.

@@ -1,8 +1,6 @@
 import pytest
-from omegaconf.errors import OmegaConfBaseException
 
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.config.option_files import composed, composed_option, plain
 from deepracer_exp.config.options import conf_dir, conf_dirs, groups, options
 from deepracer_exp.errors import BadInput, nearest
 
@@ -84,28 +82,3 @@ def test_a_track_of_ones_own_needs_no_more_than_knots_and_a_width(own):
     own("track/Oval_track.yaml", COURSE)
     with pytest.raises(BadInput, match=r"Oval_track\.yaml: the project has another track of that name"):
         compose_experiment([])
-
-
-def test_an_option_read_by_itself_is_what_hydra_composes(own):
-    own("budget/mine.yaml", BUDGET)
-    own("budget/alone.yaml", "env_steps: 7\nminutes: ${budget.env_steps}\n")
-
-    def values(compose):
-        try:
-            return plain(compose())
-        except OmegaConfBaseException as error:  # it refers to another group
-            return error.full_key
-        except BadInput as error:  # it changes another group
-            return error.why
-
-    several = [
-        (group, option)
-        for group in groups()
-        if group not in ("track", "experiment")
-        for option in options(group)
-    ]
-    assert ("budget", "alone") in several
-    for group, option in several:
-        by_hydra = values(lambda group=group, option=option: composed(None, [f"+{group}={option}"])[0][group])
-        read = values(lambda group=group, option=option: composed_option(group, option))
-        assert (group, option, read) == (group, option, by_hydra)
