@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from deepracer_exp.config import acting
-from deepracer_exp.config.compose import compose_entry, compose_experiment
+from deepracer_exp.config.compose import compose_entry, compose_experiment, trusted
 from deepracer_exp.sweeps.queue.storage import open_storage
 from deepracer_exp.sweeps.queue.study import load_study
 
@@ -214,7 +214,7 @@ STORED = {
 def test_what_a_study_stores_counts_once_its_user_has_named_the_same(account, override):
     def composed(stored: bool) -> tuple[dict, tuple[str, ...]]:
         entry = "sweep" if override.startswith("sweep") else "train"
-        made = compose_entry(entry, [override], stored=stored)
+        made = trusted(compose_entry(entry, [override]), stored=stored)
         return made.mapping, made.notes
 
     plain = compose_entry("sweep" if override.startswith("sweep") else "train", []).mapping
@@ -234,11 +234,11 @@ def test_what_a_study_stores_counts_once_its_user_has_named_the_same(account, ov
 @pytest.mark.parametrize("entity", [(), ("tracking.entity=team",)])
 def test_the_words_that_choose_a_foreign_project_are_accepted_as_they_stand(account, entity):
     chosen = ("tracking=wandb", "tracking.project=season", *entity)
-    *_, (note,) = (compose_entry("train", chosen, stored=True).notes,)
+    *_, (note,) = (trusted(compose_entry("train", chosen), stored=True).notes,)
     words = shlex.split(note.partition("to use it, give ")[2])
     assert words == list(chosen)
-    assert compose_entry("train", words).mapping["tracking"]["kind"] == "wandb"
-    assert compose_entry("train", chosen, stored=True).notes == ()
+    assert trusted(compose_entry("train", words), stored=False).mapping["tracking"]["kind"] == "wandb"
+    assert trusted(compose_entry("train", chosen), stored=True).notes == ()
 
 
 def test_the_record_of_an_account_holds_no_text_and_is_its_own(call, account, tmp_path):

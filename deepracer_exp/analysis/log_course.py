@@ -1,7 +1,6 @@
 """The courses of a recording, found by name or recognised by where the car drove."""
 
 from collections.abc import Mapping
-from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,7 +14,7 @@ from deepracer_exp.aws.logs.sim_trace import EARLIEST_CLOCK_S
 from deepracer_exp.aws.worlds.catalogue import find_world, worlds
 from deepracer_exp.aws.worlds.routes import NEAR_M, recognise, world_rows
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.config.compose import compose_option
+from deepracer_exp.config.named import service_car
 from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.config.track import TrackConfig
 from deepracer_exp.env.rules import wheels_on_road
@@ -85,12 +84,6 @@ def find_courses(recording: Recording) -> tuple[dict[str, Track], tuple[LogProbl
         except BadInput as error:
             problems.append(LogProblem(recording.name, None, str(error)))
     return tracks, tuple(problems)
-
-
-@cache
-def service_car() -> CarConfig:
-    """Return the car of the service's simulation: `car=deepracer`."""
-    return compose_option("car", "deepracer", CarConfig)
 
 
 def catalogue_track(name: str, reversed: bool = False) -> Track:

@@ -165,13 +165,12 @@ def _source(what: str, overrides: list[str], track: str | None) -> _Source:
     from deepracer_exp.analysis.proposed_actions import commands_of_log
     from deepracer_exp.aws.logs.reader import read_recording
     from deepracer_exp.aws.models.model_metadata import ModelMetadata
-    from deepracer_exp.config.compose import compose_experiment
+    from deepracer_exp.config.named import service_car
 
     recording = read_recording(place)
     commands = commands_of_log(recording, track)
     # All cars have the service's limits.
-    car = compose_experiment([])[0].car
-    return _Source(recording.name, commands, car, recording.metadata or ModelMetadata())
+    return _Source(recording.name, commands, service_car(), recording.metadata or ModelMetadata())
 
 
 def _of_track(what: str, is_route: bool, overrides: list[str], track: str | None) -> _Source:

@@ -185,7 +185,7 @@ def _write_laps_asked_for(args: argparse.Namespace, view: "LogView", episode: in
 
 def _car(config: dict[str, Any]) -> "CarConfig":
     """Return the car of a run of ours; the service's has the dimensions of the default one."""
-    from deepracer_exp.analysis.log_course import service_car
+    from deepracer_exp.config.named import service_car
     from deepracer_exp.config.parse import parse_experiment
 
     try:

@@ -120,9 +120,9 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 def _evaluate(args: argparse.Namespace) -> int:
     if args.cfg:
-        from deepracer_exp.config.compose import compose_entry
+        from deepracer_exp.config.compose import compose_evaluation
 
-        print(compose_entry("evaluate", runs_and_overrides(args)[1]).yaml(), end="")
+        print(compose_evaluation(runs_and_overrides(args)[1])[1].yaml(), end="")
         return 0
     run, overrides = run_and_overrides(args)
     check_file("--video", args.video, ".mp4")

@@ -5,7 +5,7 @@ import itertools
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,12 +19,11 @@ from deepracer_exp.addresses import without_passwords
 from deepracer_exp.aws.worlds.catalogue import find_world
 from deepracer_exp.errors import BadInput, Unknown, nearest, reading
 
-from . import acting, custom_files
-from .custom_files import read_custom_files
+from . import acting
 from .dimension import range_length
 from .evaluation import EvaluateConfig, EvaluationConfig
 from .experiment import Experiment
-from .file_overrides import FileOverrides, file_overrides
+from .file_overrides import with_custom_files
 from .learning import of_ppo_alone
 from .option_files import change, composed, composed_option, first_line, plain
 from .options import groups, listed, options
@@ -52,10 +51,10 @@ class Composition:
     """The option chosen in each group."""
     mapping: dict[str, Any]
     """All values, as plain Python."""
-    names: Mapping[str, str]
-    """Display names of the choices that come from `custom_files`, by group."""
-    notes: tuple[str, ...]
+    notes: tuple[str, ...] = ()
     """What was used of `custom_files` and what was not, a line each."""
+    names: Mapping[str, str] = field(default_factory=dict)
+    """Display names of the choices that come from `custom_files`, by group."""
 
     def yaml(self) -> str:
         """Return the values as YAML, in the order of the entry point's groups."""
@@ -77,41 +76,49 @@ def compose_experiment(overrides: Sequence[str], *, stored: bool = False) -> tup
         BadInput: an override cannot be parsed, names something unknown or gives a value that is not accepted; or code
             is not the user's own (`acting`).
     """
-    composition = compose_entry("train", overrides, stored=stored)
+    files = with_custom_files(without_passwords(list(overrides)))
+    composition = trusted(compose_entry("train", files.lines), stored=stored)
     experiment = parse_experiment(composition.mapping)
     check_names(experiment.evaluation)
     acting.refuse_reward(experiment.reward.file, "the study")
     import_own_classes(experiment)
-    return experiment, composition
+    notes = (*files.notes, *composition.notes)
+    return experiment, replace(composition, overrides=files.typed, names=files.names, notes=notes)
+
+
+def trusted(composition: Composition, *, stored: bool) -> Composition:
+    """Allow what acts among composed values, which the user has named; of a study's values leave out what is foreign.
+
+    `stored` is as of `compose_experiment`.
+    """
+    if not stored:
+        allow(composition.mapping)
+        return composition
+    left_out = acting.leave_out_foreign(composition.mapping, "the study")
+    return replace(composition, notes=(*composition.notes, *left_out))
 
 
 def compose_evaluation(overrides: Sequence[str]) -> tuple[EvaluateConfig, Composition]:
     """Compose `conf/evaluate.yaml` with the overrides and validate the result; raises as `compose_experiment`."""
-    composition = compose_entry("evaluate", overrides)
+    # The classes are those of the run that is read.
+    composition = trusted(compose_entry("evaluate", allow_given(overrides)), stored=False)
     config = parse_config(composition.mapping, EvaluateConfig)
     check_names(config.evaluation)
     return config, composition
 
 
-def compose_entry(entry: str, overrides: Sequence[str], *, stored: bool = False) -> Composition:
-    """Compose an entry point's YAML with the overrides into plain Python values; `stored` as of `compose_experiment`.
+def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
+    """Compose an entry point's YAML with the overrides into plain Python values.
 
     Raises:
-        BadInput: an override cannot be parsed or names something unknown, or a file cannot be used.
+        BadInput: an override cannot be parsed or names something unknown, or an option file cannot be used.
     """
     overrides = without_passwords(list(overrides))
-    if entry != "train":  # it reads a stored run, whose classes are its own
-        overrides = allow_given(overrides)
-    parsed = [parse_single(override) for override in overrides]
-    rest = [by_world_name(override) for override in parsed if override.key_or_group != custom_files.KEY]
-    for override in rest:
+    parsed = [by_world_name(parse_single(override)) for override in overrides]
+    for override in parsed:
         _check_key(entry, override)
-    files = _files(
-        parsed, {override.key_or_group: text for override, text in zip(parsed, overrides, strict=True)}
-    )
-    rest = [*map(parse_single, files.lines), *rest]
-    chosen = [override for override in rest if override.key_or_group in groups(entry)]
-    changing = [override for override in rest if override.key_or_group not in groups(entry)]
+    chosen = [override for override in parsed if override.key_or_group in groups(entry)]
+    changing = [override for override in parsed if override.key_or_group not in groups(entry)]
     names: tuple[str, ...] = ()
     if TRACK in groups(entry):
         names, changing = several_tracks(chosen, changing)
@@ -135,18 +142,11 @@ def compose_entry(entry: str, overrides: Sequence[str], *, stored: bool = False)
         raise BadInput(
             "track: an option file cannot choose several tracks; give them as an override: track=[A,B]"
         )
-    # Option files of the user may contain addresses, too.
-    mapping, left_out = without_passwords(mapping), list[str]()
-    if stored:
-        left_out = acting.leave_out_foreign(mapping, "the study")
-    else:
-        allow(mapping)
     return Composition(
         overrides=tuple(overrides),
         choices={group: option for group, option in choices.items() if group in groups(entry)},
-        mapping=mapping,
-        names=files.names,
-        notes=(*files.notes, *unfit, *left_out),
+        mapping=without_passwords(mapping),  # option files of the user may contain addresses, too
+        notes=tuple(unfit),
     )
 
 
@@ -256,14 +256,6 @@ def expand_grid(overrides: Sequence[str]) -> list[list[str]]:
         key = override.get_key_element()
         axes.append([f"{key}={text}" for text in override.sweep_string_iterator()])
     return [list(combination) for combination in itertools.product(*axes)]
-
-
-def _files(parsed: Sequence[Override], typed: Mapping[str, str]) -> FileOverrides:
-    """Return the overrides of the last `custom_files`, if any; `typed` has every other override by its key."""
-    folders = [override.value() for override in parsed if override.key_or_group == custom_files.KEY]
-    if not folders or folders[-1] is None:
-        return FileOverrides((), {}, ())
-    return file_overrides(read_custom_files(str(folders[-1])), typed)
 
 
 def _check_key(entry: str, override: Override) -> None:

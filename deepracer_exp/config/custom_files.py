@@ -11,13 +11,10 @@ from deepracer_exp.aws.models.hyperparameters import Hyperparameters, read_hyper
 from deepracer_exp.aws.models.job_settings import JobSettings, read_run_env
 from deepracer_exp.aws.models.model_metadata import (
     LIDARS,
-    NEURAL_NETWORKS,
     ModelMetadata,
     read_model_metadata,
 )
 from deepracer_exp.errors import BadInput
-
-from .overrides import override_line
 
 KEY = "custom_files"
 
@@ -226,27 +223,6 @@ def sensor_overrides(metadata: ModelMetadata) -> list[str]:
             f"observation.lidar.reach_m={clip_m:g}",
         ]
     return lines
-
-
-_NETWORKS = dict(zip(NEURAL_NETWORKS, ("shallow", "medium", "deep"), strict=True))
-_STEREO: Mapping[str, Any] = {
-    "filters": [32, 64, 64, 128, 128],
-    "kernels": [3, 3, 3, 3, 3],
-    "strides": [1, 2, 1, 2, 1],
-}
-"""Layers of the service's two deeper networks for two cameras (deepracer-simapp, `sensors/utils.py`)."""
-
-
-def services_network(metadata: ModelMetadata) -> tuple[str, dict[str, Any]]:
-    """Return the option of the network that the service builds for a model, and what it has instead of its values."""
-    name = _NETWORKS[metadata.neural_network]
-    return name, dict(_STEREO) if "STEREO_CAMERAS" in metadata.sensor and name != "shallow" else {}
-
-
-def network_overrides(metadata: ModelMetadata) -> list[str]:
-    """Return the overrides for the network that the service builds for a model."""
-    name, values = services_network(metadata)
-    return [f"network={name}", *(override_line(f"network.{key}", value) for key, value in values.items())]
 
 
 def read_custom_files(folder: str) -> CustomFiles:

@@ -1,30 +1,52 @@
 """The overrides that the files of a DeepRacer model and of deepracer-for-cloud stand for (`custom_files=DIR`)."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from deepracer_exp.errors import BadInput
 
-from .custom_files import FRAMES, KEY, SAC_DIFFERS, CustomFiles
+from .custom_files import FRAMES, KEY, SAC_DIFFERS, CustomFiles, read_custom_files
 from .job_overrides import job_overrides
-from .overrides import first_given, override_line
+from .overrides import first_given, key_of, override_line, parse_single
 
 
 @dataclass(frozen=True)
 class FileOverrides:
-    """The overrides that a folder of files stands for; the user's own have priority over them."""
+    """Overrides of the user's, and those that a folder of files stands for."""
 
+    typed: tuple[str, ...]
+    """The user's own, with `custom_files=DIR`."""
     lines: tuple[str, ...]
+    """Those of the files, then the user's own without `custom_files=DIR`."""
     names: Mapping[str, str]
     """Display names of the reward and the action space that come from the folder."""
     notes: tuple[str, ...]
     """What was used, and what was not and why, a line each."""
 
 
-def file_overrides(files: CustomFiles, typed: Mapping[str, str]) -> FileOverrides:
-    """Turn files into overrides.
+def with_custom_files(overrides: Sequence[str]) -> FileOverrides:
+    """Replace `custom_files=DIR` by the overrides that the files of the folder stand for; the last one counts.
+
+    Every other override has priority over the files.
+
+    Raises:
+        BadInput: an override cannot be parsed, or a file cannot be used.
+    """
+    own = tuple(line for line in overrides if key_of(line) != KEY)
+    folders = [parse_single(line).value() for line in overrides if key_of(line) == KEY]
+    if not folders or folders[-1] is None:
+        return FileOverrides(tuple(overrides), own, {}, ())
+    typed = {parse_single(line).key_or_group: line for line in own}
+    lines, names, notes = _file_overrides(read_custom_files(str(folders[-1])), typed)
+    return FileOverrides(tuple(overrides), (*lines, *own), names, tuple(notes))
+
+
+def _file_overrides(
+    files: CustomFiles, typed: Mapping[str, str]
+) -> tuple[list[str], dict[str, str], list[str]]:
+    """Turn files into overrides; returns the overrides, the names and the notes of `FileOverrides`.
 
     `typed` has the user's own overrides by key or group; they have priority.
     """
@@ -92,7 +114,7 @@ def file_overrides(files: CustomFiles, typed: Mapping[str, str]) -> FileOverride
         notes.append(f"{source}: used as {', '.join(taken)}")
     job, applied = job_overrides(files.job, typed) if files.job else ([], [])
     notes += [*applied, *_left(files, typed)]
-    return FileOverrides(tuple([*lines, *job]), names, (*notes, *files.remarks()))
+    return [*lines, *job], names, [*notes, *files.remarks()]
 
 
 def car_override(files: CustomFiles, typed: Mapping[str, str]) -> tuple[list[str], list[str]]:

@@ -57,10 +57,12 @@ def with_overrides(
             )
     new: dict[str, str] = {}
     if chosen:
-        composed = compose_entry("train", [override.input_line or "" for override in chosen], stored=stored)
+        composed = compose_entry("train", [override.input_line or "" for override in chosen])
         for change in chosen:
             values[change.key_or_group] = composed.mapping[change.key_or_group]
             new[change.key_or_group] = composed.choices[change.key_or_group]
+        if not stored:
+            allow(composed.mapping)
     for change in parsed:
         if change not in chosen:
             if change.is_delete() or change.package is not None:
@@ -77,7 +79,6 @@ def with_overrides(
         overrides=tuple(overrides),
         choices={**choices, **new},
         mapping=values,
-        names={},
         notes=tuple(line for line in left_out if not _touches(keys, line.partition("=")[0])),
     )
 

@@ -19,6 +19,7 @@ from .compose import (
     compose_entry,
     compose_evaluation,
     compose_experiment,
+    trusted,
 )
 from .dimension import Choices, as_override, dimension, override_value, plain_expression
 from .evaluation import EvaluationConfig
@@ -184,7 +185,7 @@ def compose_sweep(overrides: Sequence[str], *, stored: bool = False) -> SweepReq
     ]
     for override in of_the_sweep:
         _check_own(override)
-    composition = compose_entry(_ENTRY, of_the_sweep, stored=stored)
+    composition = trusted(compose_entry(_ENTRY, of_the_sweep), stored=stored)
     entry = parse_config(composition.mapping, SweepEntry)
     check_option("evaluation", entry.sweep.protocol, "sweep.protocol")
     train = _TrainOverrides()

@@ -15,6 +15,7 @@ from tensordict import TensorDict
 from deepracer_exp.aws.models.car_controls import full_scale, throttle
 from deepracer_exp.config.evaluation import EvaluationConfig, RealCarConfig
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.named import tracks_of
 from deepracer_exp.config.running import MLflowTracking
 from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.env.head_to_head import HeadToHead
@@ -27,7 +28,7 @@ from deepracer_exp.tracking.delivery import deliver_evaluation
 from deepracer_exp.tracking.metrics import evaluate_metric, track_labels
 from deepracer_exp.tracks.boards import Standing, standings, what_it_sees
 
-from .evaluator import Evaluator, tracks_of
+from .evaluator import Evaluator
 from .film import LapRecorder, best_attempt
 from .plan import EvaluatePlan
 from .race_protocol import RaceProtocol

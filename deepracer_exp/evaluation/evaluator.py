@@ -11,24 +11,21 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from deepracer_exp.agents.compiled_policy import CompiledPolicy
-from deepracer_exp.config.compose import compose_experiment, compose_option
-from deepracer_exp.config.driving import ObservationConfig, RandomizationConfig
+from deepracer_exp.config.driving import ObservationConfig
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.config.overrides import override_line
+from deepracer_exp.config.named import conditions_of, race_of, tracks_of
 from deepracer_exp.config.track import TrackConfig
 from deepracer_exp.env.head_to_head import HeadToHead, rival_setup
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.real_car import as_the_car, require_car
 from deepracer_exp.env.setup import Course, build_setup
 from deepracer_exp.env.trace import PACKED, STATUS_CODE
-from deepracer_exp.errors import BadInput
 from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.rewards.source import NO_REWARD
 from deepracer_exp.tracks.track import directed_tracks
 
 from .head_to_head import RivalProtocol
-from .plan import race_of
 from .race_protocol import RaceProtocol
 from .result import HELD_OUT, USUAL, Evaluation, TrialGroup
 
@@ -84,9 +81,9 @@ class Evaluator:
         """
         self.config = config
         courses = _courses(tracks_of(experiment, config))
-        conditions = {USUAL: _conditions("usual", config.usual, experiment)}
+        conditions = {USUAL: conditions_of(experiment, config, "usual")}
         if config.held_out is not None:
-            conditions[HELD_OUT] = _conditions("held_out", config.held_out, experiment)
+            conditions[HELD_OUT] = conditions_of(experiment, config, "held_out")
         for condition, randomization in conditions.items():
             if randomization.real_car is not None:
                 require_car(experiment, f"evaluation.{condition}")
@@ -222,21 +219,6 @@ def evaluator_against(rival: StoredRun | None, experiment: Experiment, config: E
     return evaluator
 
 
-def tracks_of(experiment: Experiment, config: EvaluationConfig) -> dict[str, TrackConfig]:
-    """Return the tracks of the protocol, by name.
-
-    Raises:
-        BadInput: a track is unknown.
-    """
-    if config.tracks is None:
-        return experiment.tracks
-    names = config.tracks if isinstance(config.tracks, str) else list(config.tracks)
-    try:
-        return compose_experiment([override_line("track", names)])[0].tracks
-    except BadInput as error:
-        raise BadInput("evaluation.tracks", error) from None
-
-
 def _courses(tracks: dict[str, TrackConfig]) -> tuple[Course, ...]:
     """Build the tracks; one driven in both directions counts as two."""
     courses = []
@@ -246,15 +228,6 @@ def _courses(tracks: dict[str, TrackConfig]) -> tuple[Course, ...]:
             label += " reversed" * (track.reversed and config.direction == "alternate")
             courses.append(Course(name=label, weight=1.0, tracks=(track,)))
     return tuple(courses)
-
-
-def _conditions(key: str, option: str | None, experiment: Experiment) -> RandomizationConfig:
-    if option is None:
-        return experiment.randomization
-    try:
-        return compose_option("randomization", option, RandomizationConfig)
-    except BadInput as error:
-        raise BadInput(f"evaluation.{key}", error) from None
 
 
 def _starts(config: EvaluationConfig, closed: bool, condition: str, pairs: bool) -> NDArray[np.float64]:

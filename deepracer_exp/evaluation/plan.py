@@ -4,13 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from deepracer_exp.config.compose import compose_evaluation, compose_option
-from deepracer_exp.config.evaluation import EvaluateConfig, EvaluationConfig
-from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.compose import compose_evaluation
+from deepracer_exp.config.evaluation import EvaluateConfig
+from deepracer_exp.config.named import race_of
 from deepracer_exp.config.overrides import group_of, key_of
 from deepracer_exp.config.own_class import OF_POLICY
 from deepracer_exp.config.parse import import_own_classes
-from deepracer_exp.config.race import RaceConfig
 from deepracer_exp.config.stored import evaluate_as_stored
 from deepracer_exp.env.real_car import require_car
 from deepracer_exp.errors import BadInput
@@ -52,20 +51,6 @@ def plan_evaluation(run: str, overrides: Sequence[str], *, has_checkpoint: bool 
     if config.evaluation.real_car is not None:
         require_car(stored.experiment)
     return EvaluatePlan(stored, config, _rival(stored, config))
-
-
-def race_of(experiment: Experiment, config: EvaluationConfig) -> RaceConfig:
-    """Return the race of a protocol, or that of the experiment.
-
-    Raises:
-        BadInput: there is no such option.
-    """
-    if config.race is None:
-        return experiment.race
-    try:
-        return compose_option("race", config.race, RaceConfig)
-    except BadInput as error:
-        raise BadInput("evaluation.race", error) from None
 
 
 def _rival(stored: StoredRun, config: EvaluateConfig) -> StoredRun | None:

@@ -16,10 +16,9 @@ from deepracer_exp.aws.models.model_metadata import (
     model_metadata_text,
 )
 from deepracer_exp.aws.worlds.catalogue import find_world
-from deepracer_exp.config.compose import compose_option
-from deepracer_exp.config.custom_files import services_network
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.learning import CNNConfig
+from deepracer_exp.config.named import network_overrides, services_layers
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.errors import BadInput
@@ -114,13 +113,11 @@ def services_kind(experiment: Experiment, metadata: ModelMetadata) -> str:
     }
     options = []
     for kind in NEURAL_NETWORKS:
-        option, values = services_network(replace(metadata, neural_network=kind))
-        services = vars(compose_option("network", option, CNNConfig)) | values
+        built = replace(metadata, neural_network=kind)
+        services = services_layers(built)
         if all(list(value) == list(services[key]) for key, value in layers.items()):
             return kind
-        options.append(
-            f"network={option}" + "".join(f" network.{key}={value}" for key, value in values.items())
-        )
+        options.append(" ".join(network_overrides(built)))
     shown = ", ".join(f"{key}={list(value)}" for key, value in layers.items())
     raise BadInput("network", f"{shown}: the service builds no such network", "; or ".join(options))
 

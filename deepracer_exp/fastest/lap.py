@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.config.compose import compose_option
-from deepracer_exp.config.driving import RandomizationConfig
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.named import no_randomization
 from deepracer_exp.env.action_space import ContinuousActions, build_action_space
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.setup import Course, build_setup
@@ -171,7 +170,7 @@ class Question:
         plain = replace(
             experiment,
             observation=replace(experiment.observation, camera=None, lidar=None),
-            randomization=compose_option("randomization", "none", RandomizationConfig),
+            randomization=no_randomization(),
             episode=replace(experiment.episode, max_steps=0),
         )
         course = Course(name=track.name, weight=1.0, tracks=(track,))

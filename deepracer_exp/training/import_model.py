@@ -19,22 +19,21 @@ from deepracer_exp.agents.service_weights import (
 from deepracer_exp.aws.models.archive import StoredModel, Tensors, read_model
 from deepracer_exp.aws.models.job_settings import read_training_params
 from deepracer_exp.aws.models.model_metadata import NEURAL_NETWORKS, ModelMetadata
-from deepracer_exp.config.compose import Composition, compose_experiment, compose_option
+from deepracer_exp.config.compose import Composition, compose_experiment
 from deepracer_exp.config.custom_files import (
     KEY,
     PLACES,
     SAC_DIFFERS,
     CustomFiles,
-    network_overrides,
     read_custom_files,
     sensor_overrides,
-    services_network,
 )
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.file_overrides import car_override
 from deepracer_exp.config.imported_options import import_files, remove_options
 from deepracer_exp.config.job_overrides import job_overrides
 from deepracer_exp.config.learning import CNNConfig, SACConfig
+from deepracer_exp.config.named import network_overrides, services_layers
 from deepracer_exp.config.overrides import key_of, override_line
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import observation_shape
@@ -128,8 +127,7 @@ def _fit(
     for kind in _kinds(metadata, tensors):
         network = network_overrides(replace(metadata, neural_network=kind))
         if files.is_sac:
-            option, _ = services_network(replace(metadata, neural_network=kind))
-            hidden = [*compose_option("network", option, CNNConfig).hidden, SAC_HIDDEN]
+            hidden = [*services_layers(replace(metadata, neural_network=kind))["hidden"], SAC_HIDDEN]
             network.append(override_line("network.hidden", hidden))
         described = [override_line(KEY, files.folder), *lines, *network, override_line("name", name)]
         experiment, composition = compose_experiment([*described, *changes])
@@ -164,8 +162,7 @@ def _kinds(metadata: ModelMetadata, tensors: Tensors) -> Iterator[str]:
     for kind in NEURAL_NETWORKS:
         if kind == metadata.neural_network:
             continue
-        option, values = services_network(replace(metadata, neural_network=kind))
-        layers = vars(compose_option("network", option, CNNConfig)) | values
+        layers = services_layers(replace(metadata, neural_network=kind))
         inputs = [2 if "STEREO_CAMERAS" in metadata.sensor else 1, *layers["filters"]]
         built = zip(layers["kernels"], layers["kernels"], inputs, layers["filters"], strict=False)
         if sorted(shape for shape in built if shape[0] > 1) == held:

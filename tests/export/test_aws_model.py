@@ -14,7 +14,8 @@ from deepracer_exp.agents.service_weights import VALUE, to_service
 from deepracer_exp.aws.models.model_metadata import NEURAL_NETWORKS, ModelMetadata, read_model_metadata
 from deepracer_exp.aws.models.tf_checkpoint import read_index, read_tensors
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.config.custom_files import network_overrides, sensor_overrides
+from deepracer_exp.config.custom_files import sensor_overrides
+from deepracer_exp.config.named import network_overrides
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.export.aws_model import aws_model, services_kind
