@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from deepracer_exp.aws.logs.recording import TRAINING
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.errors import BadInput, count
-from deepracer_exp.rewards.guard import Guard, Misconduct
-from deepracer_exp.rewards.reward import RewardFailed, RewardFunction
+from deepracer_exp.rewards.reward import Failure, RewardFailed, RewardFunction
 from deepracer_exp.rewards.source import RewardSource
 from deepracer_exp.tracks.track import Track
 
@@ -240,17 +239,11 @@ def _one_by_one(
     function: RewardFunction, params: RecordedParams, steps: pd.DataFrame, some: Ids
 ) -> NDArray[np.float64]:
     paid = np.empty(len(some))
-    index = 0
-    try:
-        with Guard(function.time_limit_s) as guard:
-            for index, values in enumerate(params.dicts(some)):
-                paid[index] = function.compute(values)
-                guard.restart()
-    except (RewardFailed, Misconduct) as error:
-        what = error.what if isinstance(error, RewardFailed) else str(error)
-        raise BadInput(
-            function.source.path, f"reward_function {what} ({_place(steps, some[index])})"
-        ) from error
+    for index, answer in enumerate(function.answers(params.dicts(some))):
+        if isinstance(answer, Failure):
+            place = _place(steps, some[index])
+            raise BadInput(function.source.path, f"reward_function {answer.what} ({place})") from answer.error
+        paid[index] = answer
     return paid
 
 

@@ -4,6 +4,7 @@ import hashlib
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,7 @@ import pandas as pd
 from deepracer_exp.aws.logs.recording import LogProblem
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.errors import BadInput
-from deepracer_exp.rewards.guard import CtrlC, Guard
-from deepracer_exp.rewards.reward import RewardFunction, Unusable, what_happened
+from deepracer_exp.rewards.reward import Failure, RewardFunction, Unusable, answers
 from deepracer_exp.rewards.source import RewardSource, is_of_zoo
 
 from .log_view import LogView
@@ -84,18 +84,13 @@ def contributed_terms(
     if not len(evaluated):
         return None
     by_step: list[dict[str, float]] = []
-    try:
-        with Guard(time_limit_s) as guard:
-            for values in params.dicts(evaluated):
-                by_step.append(_checked(terms, values))
-                guard.restart()
-    except CtrlC:
-        raise
-    except BaseException as error:  # noqa: BLE001 - raised again as BadInput
-        what, cause = what_happened(error, source.path, time_limit_s)
-        step = steps.iloc[evaluated[min(len(by_step), len(evaluated) - 1)]]
-        place = f"episode {step['episode']}, step {step['steps']}"
-        raise BadInput(source.path, f"terms {what} ({place})") from cause
+    calls = answers(partial(_checked, terms), params.dicts(evaluated), source.path, time_limit_s)
+    for row, answer in zip(evaluated, calls, strict=True):
+        if isinstance(answer, Failure):
+            step = steps.iloc[row]
+            place = f"episode {step['episode']}, step {step['steps']}"
+            raise BadInput(source.path, f"terms {answer.what} ({place})") from answer.error
+        by_step.append(answer)
     names = dict.fromkeys(name for contributed in by_step for name in contributed)
     columns = {name: np.array([contributed.get(name, 0.0) for contributed in by_step]) for name in names}
     return pd.DataFrame(columns, index=steps.index[evaluated], copy=False)

@@ -1,22 +1,24 @@
-"""Calls reward functions for many cars, guarded and checked."""
+"""Calls reward functions for many cars: with a time limit, and checked."""
 
 import itertools
 import math
 import reprlib
-import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from types import CodeType
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deepracer_exp.errors import BadInput, RunFailed
 
-from .guard import CtrlC, DeadlinePassed, Guard, Misconduct, run_module
 from .params import TrackParams, batch_params, row_keys, rows, scalar_params, select
 from .prints import RewardPrints
 from .source import RewardSource, source_with_constants
+from .time_limit import TimeLimit, TimeLimitPassed, run_module
+
+Value = TypeVar("Value")
 
 MAX_REWARD = 1e5
 """Larger absolute rewards end the job on the service (deepracer-simapp rollout_agent_ctrl.py)."""
@@ -31,16 +33,10 @@ class RewardFailed(RunFailed):
         params: dict[str, Any] | None = None,
         car: int | None = None,
         what: str = "",
-        hung: bool = False,
-        returned: bool = False,
     ) -> None:
         super().__init__(message)
         self.what = what
         """Part of the message: what the function did, and in which line."""
-        self.hung = hung
-        """Whether the time limit was exceeded."""
-        self.returned = returned
-        """Whether it returned something that is not a reward, so that `what` has no line."""
         self.params = params
         """The params of the call (`reward_batch`: of all cars, if the car is not known)."""
         self.car = car
@@ -57,7 +53,7 @@ class RewardFunction:
     Args:
         source: The module and the values that replace its constants.
         n_cars: Number of cars.
-        time_limit_s: Seconds of CPU for all calls of one step (see `Guard` for where it holds).
+        time_limit_s: Seconds of CPU for all calls of one step (see `TimeLimit` for where it holds).
         prints: Where `print` goes; None discards it.
         scalar: Call `reward_function` even where the module has `reward_batch`.
 
@@ -86,14 +82,13 @@ class RewardFunction:
         name = "reward_batch" if self.is_batch else "reward_function"
         cars = [None] if self.is_batch else list(range(n_cars))
         try:
-            with Guard(time_limit_s):
+            with TimeLimit(time_limit_s):
                 self.functions = [self._load(code, name, prints, car) for car in cars]
-        except CtrlC:
+        except KeyboardInterrupt:
             raise
-        except BaseException as error:  # noqa: BLE001 - raised again as one of ours
-            what, cause = what_happened(error, source.path, time_limit_s)
+        except BaseException as error:
             how = "" if isinstance(error, Unusable) else "cannot be run: "
-            raise BadInput(source.path, f"{how}{what}") from cause
+            raise BadInput(source.path, f"{how}{what_happened(error, source.path)}") from error
         self._track_params: Sequence[TrackParams] = ()
         self._waypoints: list[np.ndarray] = []
 
@@ -130,19 +125,12 @@ class RewardFunction:
             rewards[cars] = call(columns, track_params, track_of, cars)
         return rewards
 
-    def compute(self, params: dict[str, Any]) -> float:
-        """Return the reward of the first car's module (`scalar`) for given params; call it inside a `Guard`.
-
-        Raises:
-            RewardFailed: The function raised, timed out, or returned no finite number within +-`MAX_REWARD`.
-        """
-        before = dict(params)
-        try:
-            return _as_reward(self.functions[0](params))
-        except CtrlC:
-            raise
-        except BaseException as error:  # noqa: BLE001 - raised again as one of ours
-            self._fail(error, 0, before)
+    def answers(self, calls: Iterable[dict[str, Any]]) -> Iterator["float | Failure"]:
+        """Yield the reward of the first car's module (`scalar`) for each of the params, or why there is none."""
+        function = self.functions[0]
+        return answers(
+            lambda params: _as_reward(function(params)), calls, self.source.path, self.time_limit_s
+        )
 
     def _load(
         self, code: CodeType, name: str, prints: RewardPrints | None, car: int | None
@@ -171,14 +159,14 @@ class RewardFunction:
         table, own_params = list(rows(selected)), [track_params[place] for place in track_of.tolist()]
         keys = row_keys(selected)
         try:
-            with Guard(self.time_limit_s):
+            with TimeLimit(self.time_limit_s):
                 for car, road, row in zip(cars, own_params, table, strict=True):
                     reward = functions[car](scalar_params(row, road, keys))
                     # A float within the bounds needs no further check; NaN fails the comparison.
                     if type(reward) is not float or not -MAX_REWARD <= reward <= MAX_REWARD:
                         reward = _as_reward(reward)
                     rewards.append(reward)
-        except CtrlC:
+        except KeyboardInterrupt:
             raise
         except BaseException as error:  # noqa: BLE001 - raised again as one of ours
             # There is a reward for each car so far; the time limit may be exceeded right after the last one.
@@ -208,11 +196,11 @@ class RewardFunction:
 
         ends = (0, len(ids))
         try:
-            with Guard(self.time_limit_s):
+            with TimeLimit(self.time_limit_s):
                 for ends in itertools.pairwise(bounds):
                     returned = self.functions[0](params(*ends))
                     rewards[slice(*ends)] = _as_rewards(returned, ends[1] - ends[0])
-        except CtrlC:
+        except KeyboardInterrupt:
             raise
         except BaseException as error:  # noqa: BLE001 - raised again as one of ours
             self._fail(error, None, params(*ends))
@@ -229,49 +217,71 @@ class RewardFunction:
         """Raise RewardFailed for an error of the function."""
         function = "reward_batch" if self.is_batch else "reward_function"
         where = f"{len(params['steps'])} cars" if car is None else f"car {car}, step {params['steps']:g}"
-        what, cause = what_happened(error, self.source.path, self.time_limit_s)
+        what = what_happened(error, self.source.path)
         message = f"reward {self.source.name}: {function} {what} ({where})"
-        hung, returned = isinstance(error, DeadlinePassed), isinstance(error, Unusable)
-        raise RewardFailed(message, params, car, what, hung, returned) from cause
+        raise RewardFailed(message, params, car, what) from error
 
 
-class _Traceback(Exception):  # noqa: N818 - as `multiprocessing` has it for errors of other processes
-    """The traceback of an error in a reward function, as text."""
+@dataclass(frozen=True)
+class Failure:
+    """A call of a reward function that failed."""
 
-    def __init__(self, text: str) -> None:
-        super().__init__(f"\n{text}")
+    what: str
+    """What the function did, and in which line."""
+    params: dict[str, Any]
+    """The params, as they were given."""
+    error: BaseException
+
+    @property
+    def hung(self) -> bool:
+        """Whether the time limit was exceeded."""
+        return isinstance(self.error, TimeLimitPassed)
+
+    @property
+    def returned(self) -> bool:
+        """Whether it returned something that is not a reward, so that `what` has no line."""
+        return isinstance(self.error, Unusable)
+
+
+def answers(
+    function: Callable[[dict[str, Any]], Value],
+    calls: Iterable[dict[str, Any]],
+    path: str,
+    time_limit_s: float,
+) -> Iterator[Value | Failure]:
+    """Call a function of a reward module with each of the params in their order, and yield what it returns.
+
+    `path` is the module's, for the line of an error; the limit is of each call.
+    """
+    for params in calls:
+        before = dict(params)  # the function may change them
+        try:
+            with TimeLimit(time_limit_s):
+                answer: Value | Failure = function(params)
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # noqa: BLE001 - of the module's code
+            answer = Failure(what_happened(error, path), before, error)
+        yield answer
 
 
 class Unusable(Exception):  # noqa: N818 - reads as what it is at the raise site
     """A reward module returned or defined something that cannot be used."""
 
 
-def what_happened(error: BaseException, path: str, time_limit_s: float) -> tuple[str, Exception | None]:
-    """Describe an error of the code of module `path` in one line with its place; also return its traceback as a cause.
-
-    The error itself is not passed on: printing it would run code of the module (`__str__`, `__repr__`) without a
-    guard.
-    """
+def what_happened(error: BaseException, path: str) -> str:
+    """Describe an error of the code of module `path` in one line with its place."""
     if isinstance(error, Unusable):
-        return str(error), None
+        return str(error)
     line, trace = 0, error.__traceback__
     while trace is not None:
         if trace.tb_frame.f_code.co_filename == path:
             line = trace.tb_lineno
         trace = trace.tb_next
-    place = f" in line {line} of {path}" if line else ""
-    try:
-        with Guard(time_limit_s):
-            if isinstance(error, Misconduct):
-                said = str(error)
-            else:
-                message = _one_line(str(error))
-                said = f"raised {type(error).__name__}{': ' + message if message else ''}"
-            return said + place, _Traceback("".join(traceback.format_exception(error)))
-    except CtrlC:
-        raise
-    except BaseException:  # noqa: BLE001 - of the error's own code
-        return f"raised an error that cannot be printed{place}", None
+    message = _one_line(str(error))
+    if not isinstance(error, TimeLimitPassed):
+        message = f"raised {type(error).__name__}{': ' + message if message else ''}"
+    return f"{message} in line {line} of {path}" if line else message
 
 
 def _as_reward(value: object) -> float:

@@ -6,8 +6,6 @@ import time
 from collections.abc import Callable
 from types import FrameType
 
-from deepracer_exp.rewards.guard import CtrlC
-
 PATIENCE_S = 4.0
 """Seconds after a signal at which an iteration that can be left out is; to end the workers takes some more."""
 _LOOK_EVERY_S = 0.1
@@ -62,7 +60,7 @@ class Interruption:
 
     def _hear(self, signum: int, _: FrameType | None) -> None:
         if self.signum is not None:
-            raise CtrlC
+            raise KeyboardInterrupt
         self.signum = signum
         self._asked.set()
         if self._outer is not None:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from deepracer_exp.rewards.guard import run_module
+from deepracer_exp.rewards.time_limit import run_module
 
 from .coverage import Coverage
 

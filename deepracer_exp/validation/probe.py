@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepracer_exp.env.setup import RaceSetup
-from deepracer_exp.rewards.guard import Guard, Misconduct
-from deepracer_exp.rewards.reward import RewardFailed, RewardFunction
+from deepracer_exp.rewards.reward import Failure, RewardFunction
 
 from .situations import FIRST_STEP, Situations, start
 
@@ -38,8 +37,7 @@ class Probe:
         calls: number of calls made since.
         failures: error messages and the params that caused them, in the order of these calls.
         without_line: the error messages of all calls that name no line, because of what the function returned.
-        hangs: a call exceeded the time limit or damaged the interpreter's shared state; every later call counts as
-            failed without being made.
+        hangs: a call exceeded the time limit; every later call counts as failed without being made.
 
     Raises:
         BadInput: the module cannot be loaded.
@@ -73,38 +71,33 @@ class Probe:
         Each of the n situations `before` is passed to the function just before its counterpart.
         """
         if before is None:
-            answers = self._answers(situations.params())[: len(situations)]
+            answers = self._answers(situations.params())
         else:
             both = chain.from_iterable(zip(before.params(), situations.params(), strict=True))
-            answers = self._answers(both)[1 : 2 * len(situations) : 2]
+            answers = self._answers(both)[1::2]
         return np.array([answer.reward for answer in answers])
 
     def _answers(self, calls: Iterable[dict[str, Any]]) -> list[Answer]:
-        """Call the function with each params; an error that shows only after the last call is appended."""
-        answers: list[Answer] = []
+        """Call the function with each params."""
         waiting = iter(calls)
-        params: dict[str, Any] = {}
-        try:
-            with Guard(self._function.time_limit_s) as guard:
-                for params in waiting:
-                    if self.hangs:
-                        answers.append(Answer(float("nan"), NOT_CALLED))
-                        continue
-                    guard.restart()
-                    self.calls += 1
-                    try:
-                        answers.append(Answer(self._function.compute(params)))
-                    except RewardFailed as error:
-                        self.hangs = error.hung
-                        self.without_line |= {error.what} if error.returned else set()
-                        self.failures.append((error.what, error.params or {}))
-                        answers.append(Answer(float("nan"), error.what))
-        except Misconduct as error:
-            self.hangs = True
-            self.failures.append((str(error), params))
-            answers.append(Answer(float("nan"), str(error)))
-            answers += (Answer(float("nan"), NOT_CALLED) for _ in waiting)
-        return answers
+        found = [] if self.hangs else [self._answer(answer) for answer in self._until_it_hangs(waiting)]
+        return [*found, *(Answer(float("nan"), NOT_CALLED) for _ in waiting)]
+
+    def _until_it_hangs(self, calls: Iterator[dict[str, Any]]) -> Iterator[float | Failure]:
+        for answer in self._function.answers(calls):
+            yield answer
+            if self.hangs:
+                return
+
+    def _answer(self, answer: float | Failure) -> Answer:
+        """Count a call, and keep why it failed."""
+        self.calls += 1
+        if not isinstance(answer, Failure):
+            return Answer(answer)
+        self.hangs = answer.hung
+        self.without_line |= {answer.what} if answer.returned else set()
+        self.failures.append((answer.what, answer.params))
+        return Answer(float("nan"), answer.what)
 
 
 _COMPARISONS: dict[type[ast.cmpop], Callable[[float, float], bool]] = {

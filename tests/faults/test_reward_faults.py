@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from deepracer_exp.runs.trace import read_trace
-from tests.conftest import IN_PROCESS, IN_WORKERS
+from tests.conftest import IN_WORKERS
 from tests.training.conftest import workers_start_early  # noqa: F401 - a fixture
 
 DEAF = """
@@ -20,44 +20,11 @@ def reward_function(params):
 """Never returns to the interpreter, which alone could raise an error; a loop that catches all may be left some time."""
 
 
-# What a reward function can do to the process around it, and what is said of it.
-ZOO = {
-    "text": ("raise Evil", "raised an error that cannot be printed"),
-    "interrupt": ("raise KeyboardInterrupt", "raised KeyboardInterrupt"),
-    "built-in": ("import builtins; builtins.len = builtins.print = None", "replaced builtins."),
-    "stream": ("sys.stdout = None", "replaced sys.stdout"),
-    "closes": ("sys.stdout.close()", "closed sys.stdout"),
-    "detaches": ("sys.stdout.detach()", "closed sys.stdout"),
-    "leaves": ("os._exit(0)", "left it with exit code 0"),
+WHEN = {
+    "load": "import os\nos._exit(0)\ndef reward_function(params):\n    return 1.0\n",
+    "call": "import os\ndef reward_function(params):\n    os._exit(0)\n",
 }
-WHEN = {"load": "{}\ndef reward_function(params):\n    return 1.0\n"}
-WHEN["call"] = "def reward_function(params):\n    {}\n    return 1.0\n"
-EVIL = "import os, sys\nclass Evil(Exception):\n    def __str__(self): raise SystemExit(0)\n"
-
-
-def write_hostile(folder, kind, when):
-    path = folder / "hostile.py"
-    path.write_text(EVIL + WHEN[when].format(ZOO[kind][0]))
-    return str(path)
-
-
-@pytest.mark.parametrize("when", WHEN)
-@pytest.mark.parametrize("kind", list(ZOO)[:-3])
-def test_a_hostile_reward_fails_a_training_and_a_validation_in_one_line(call, tmp_path, kind, when):
-    override = f"reward.file={write_hostile(tmp_path, kind, when)}"
-    for command in (("validate",), ("train", *IN_PROCESS)):
-        ended = call(*command, override)
-        assert ended.code == (3 if command[0] == "train" and when == "call" else 2), ended.stderr
-        assert ZOO[kind][1] in ended.stdout + ended.stderr
-        assert "Traceback" not in ended.stderr
-        assert "finished" not in ended.stdout
-
-
-@pytest.mark.parametrize("kind", ["interrupt", "built-in"])
-def test_a_hostile_reward_fails_a_replay_in_one_line(call, trained, tmp_path, kind):
-    run = str(trained().folder)
-    ended = call("analyze", run, "--output", "page.html", "--reward", write_hostile(tmp_path, kind, "call"))
-    ended.assert_refused(ZOO[kind][1])
+"""A reward function that leaves the process, by when it does."""
 
 
 @pytest.mark.slow
@@ -66,12 +33,13 @@ def test_a_hostile_reward_fails_a_replay_in_one_line(call, trained, tmp_path, ki
 def test_a_reward_that_leaves_the_process_never_ends_a_command_with_0(
     run_at, trained, tmp_path, command, when
 ):
-    file = write_hostile(tmp_path, "leaves", when)
+    file = tmp_path / "leaves.py"
+    file.write_text(WHEN[when])
     match command:
         case "validate":
             arguments = ["validate", f"reward.file={file}"]
         case "analyze":
-            arguments = ["analyze", str(trained().folder), "--output", "page.html", "--reward", file]
+            arguments = ["analyze", str(trained().folder), "--output", "page.html", "--reward", str(file)]
         case "sweep":
             tiny = ("experiment=tiny", "tracking=off", "sweep.trials=1", "sweep.workers=1")
             arguments = ["sweep", *tiny, "algorithm.lr=1e-3,1e-4", f"reward.file={file}"]
@@ -96,17 +64,6 @@ def test_workers_that_die_silently_are_reported_without_naming_an_empty_log(run_
     ended = run_at(tmp_path, "sweep", *tiny, "algorithm.lr=1e-3,1e-4", "reward.file=mine.py")
     assert ended.code == 3
     assert "the last one with exit code 0; a reward function can do that;" in ended.complaint
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("when", WHEN)
-@pytest.mark.parametrize("kind", ["closes", "detaches"])
-def test_what_is_found_is_still_reported_when_the_reward_has_closed_its_stream(run_at, tmp_path, kind, when):
-    """Each call closes the stream again."""
-    ended = run_at(tmp_path, "validate", f"reward.file={write_hostile(tmp_path, kind, when)}")
-    assert ended.code == 2
-    assert ZOO[kind][1] in (ended.stderr if when == "load" else ended.stdout)
-    assert "Traceback" not in ended.stderr
 
 
 @pytest.fixture

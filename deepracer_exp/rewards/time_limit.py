@@ -1,0 +1,72 @@
+"""How the code of a reward function is run: its module, and the time limit of a block of its code."""
+
+import signal
+import threading
+import time
+from types import CodeType, FrameType
+from typing import Any, Self
+
+_LOOKS = 4
+"""How often in the time of the limit it is looked whether it has passed."""
+_WAIT_FACTOR = 10
+"""Limit of waiting, such as in `sleep`, which uses no CPU, over the limit of CPU time."""
+
+
+def run_module(code: CodeType, namespace: dict[str, Any]) -> None:
+    """Run the compiled module of a reward function in a namespace; only here a text is executed as a program."""
+    exec(code, namespace)
+
+
+class TimeLimitPassed(BaseException):
+    """A reward function took too long; no `Exception`, so that its own `except Exception` does not catch it."""
+
+
+class TimeLimit:
+    """Ends a block of a reward function's code that computes or waits for too long; a context manager.
+
+    The limit is CPU time of this thread: however busy the machine is, only the code itself can use it up. Code that
+    waits without computing is ended after `_WAIT_FACTOR` times the limit, of which a pause of the whole process uses
+    up one look.
+
+    Python passes signals on to the main thread, between two of its instructions. In other threads, on platforms without
+    interval timers and within code in C there is no limit; a worker that hangs there is ended by the watchdog.
+
+    Raises:
+        TimeLimitPassed: inside the block, at each look until it is left.
+    """
+
+    def __init__(self, limit_s: float) -> None:
+        self._limit_s = limit_s
+        self._looks = 0
+        self._is_over = False
+        self._holds = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
+
+    def __enter__(self) -> Self:
+        if self._holds:
+            self._began_s, self._cpu_began_s = time.monotonic(), time.thread_time()
+            self._handler = signal.signal(signal.SIGALRM, self._look)
+            every_s = self._limit_s / _LOOKS
+            self._timer = signal.setitimer(signal.ITIMER_REAL, every_s, every_s)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._is_over = True
+        if self._holds:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            signal.signal(signal.SIGALRM, self._handler)
+            left_s, interval_s = self._timer
+            if left_s:
+                # A timer that has expired meanwhile fires at once; 0 would switch it off.
+                left_s = max(left_s - (time.monotonic() - self._began_s), 1e-3)
+                signal.setitimer(signal.ITIMER_REAL, left_s, interval_s)
+
+    def _look(self, signum: int, frame: FrameType | None) -> None:
+        if self._is_over or frame is None or frame.f_code.co_filename == __file__:
+            return
+        self._looks += 1
+        limit = f"the time limit of {self._limit_s:g} s of CPU for one step"
+        if time.thread_time() - self._cpu_began_s >= self._limit_s:
+            raise TimeLimitPassed(f"took longer than {limit}")
+        if self._looks >= _WAIT_FACTOR * _LOOKS:
+            waits = f"{self._limit_s * _WAIT_FACTOR:g} s without computing: {_WAIT_FACTOR} times {limit}"
+            raise TimeLimitPassed(f"took longer than {waits}")
