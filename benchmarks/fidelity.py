@@ -260,7 +260,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         raise BadInput("--leave-one-out --car: accepted: one of the two, since cars are fitted")
     recorded = read_recorded(options.traces)
     versions: dict[str, Any] = {}
-    drawn: list[tuple[int, Parts]] = []
+    drawn: list[tuple[int, list[tuple[Recorded, Fit]]]] = []
     for one in recorded:
         print(describe(one), flush=True)
     for version in sorted({one.version for one in recorded}):
@@ -290,7 +290,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         }
         for one in mine:
             print(f"  {show_recording(one.name, versions[str(version)]['recordings'][one.name])}", flush=True)
-        drawn.append((version, parts))
+        drawn.append((version, [(one, measured.fitted) for one, measured in parts]))
     write_json(options.json, {"versions": versions, "leave_one_out": options.leave_one_out})
     if options.figures is not None:
         from benchmarks.fidelity_figures import draw

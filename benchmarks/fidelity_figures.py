@@ -11,8 +11,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.fidelity import Parts
-from benchmarks.recorded import BANDS, LENGTHS, in_band, join
+from benchmarks.calibrate import Fit
+from benchmarks.recorded import BANDS, LENGTHS, Recorded, in_band, join
 from benchmarks.replay import WARM_UP_STEPS, cut_windows, errors, replay
 
 Floats = NDArray[np.float64]
@@ -23,7 +23,8 @@ _LEAST = 20
 """Fewer windows are not drawn."""
 _BINS = 9
 
-Drawn = Sequence[tuple[int, Parts]]
+Drawn = Sequence[tuple[int, Sequence[tuple[Recorded, Fit]]]]
+"""Versions, each with its recordings and the car that was fitted to each."""
 
 
 def draw(versions: Drawn, folder: Path) -> list[Path]:
@@ -41,13 +42,13 @@ def _laps(versions: Drawn) -> plt.Figure:
     figure, axes = plt.subplots(1, len(versions), figsize=(4.6 * len(versions), 3.8), squeeze=False)
     for axis, (version, parts) in zip(axes[0], versions, strict=True):
         # The recording with most rows; of its episodes, complete laps before others, then the shortest.
-        one, measured = max(parts, key=lambda each: len(each[0].steps))
+        one, fitted = max(parts, key=lambda each: len(each[0].steps))
         of = ["stream", "worker", "iteration", "episode"]
         episodes = one.steps.groupby(of, sort=False, observed=True)
         laps = episodes.agg(rows=("steps", "size"), progress=("progress", "max")).reset_index()
         lap = laps.sort_values(["progress", "rows"], ascending=[False, True]).iloc[0]
         rows = one.steps[(one.steps[of] == list(lap[of])).all(axis=1)]
-        car, yaw = measured.fitted.car, np.radians(rows["yaw"])
+        car, yaw = fitted.car, np.radians(rows["yaw"])
         origin = [rows[c] - car.front_point_m * turn(yaw) for c, turn in (("X", np.cos), ("Y", np.sin))]
         axis.plot(*origin, color=RECORDED, lw=2.6)
         for begin in range(0, len(rows) - LENGTHS["one_second"], LENGTHS["three_second"]):
@@ -55,7 +56,7 @@ def _laps(versions: Drawn) -> plt.Figure:
             piece = cut_windows(rows.iloc[max(0, begin - WARM_UP_STEPS) :], car.front_point_m, ahead)
             piece = piece.choose(np.arange(len(piece)) == (begin > 0))
             if len(piece):
-                path = np.vstack([piece.start, replay(car, piece, measured.fitted.observer)[0]])
+                path = np.vstack([piece.start, replay(car, piece, fitted.observer)[0]])
                 axis.plot(*path[:, :2].T, color=SIMULATED, lw=1.4)
                 axis.plot(*path[0, :2], "o", color=SIMULATED, ms=4)
         axis.set_aspect("equal")
@@ -83,7 +84,7 @@ def _residuals(versions: Drawn) -> plt.Figure:
     for row, (version, parts) in zip(axes, versions, strict=True):
         each = [one.windows["one_second"] for one, _ in parts]
         windows = join(each)
-        fits = [measured.fitted for _, measured in parts]
+        fits = [fitted for _, fitted in parts]
         paths = [replay(fit.car, of, fit.observer) for fit, of in zip(fits, each, strict=True)]
         off = errors(np.concatenate(paths), windows)
         yaw = windows.truth[:, -1, 2]

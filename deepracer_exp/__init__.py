@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from .evaluation.result import Evaluation
     from .stopping.rules import Decision, StoppingRule
     from .tracking.tracker import Tracker
-    from .training.callback import Callback, TrainResult
-    from .training.trainer import Trainer
+    from .training.result import TrainResult
+    from .training.trainer import Callback, Trainer
 
 __version__ = "0.1.0"
 __all__ = [
@@ -65,8 +65,8 @@ _MODULES = {
     "evaluation.result": ("Evaluation",),
     "stopping.rules": ("Decision", "StoppingRule"),
     "tracking.tracker": ("Tracker",),
-    "training.callback": ("Callback", "TrainResult"),
-    "training.trainer": ("Trainer",),
+    "training.result": ("TrainResult",),
+    "training.trainer": ("Callback", "Trainer"),
 }
 """The module of each class; a worker process imports only those whose classes the user's own classes derive from."""
 

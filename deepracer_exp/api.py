@@ -22,9 +22,10 @@ from deepracer_exp.evaluation.result import Evaluation
 from deepracer_exp.lookup.resolve import resolve
 from deepracer_exp.runs.files import METRICS, SUMMARY, read_config, read_metrics, read_object
 from deepracer_exp.runs.recording import read_run_recording
-from deepracer_exp.training.callback import Callback, TrainResult
 from deepracer_exp.training.plan import plan_resume, plan_training
+from deepracer_exp.training.result import TrainResult
 from deepracer_exp.training.run import run_training
+from deepracer_exp.training.trainer import Callback
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from deepracer_exp.analysis.log_tables import Table
     from deepracer_exp.config.running import TrackingConfig
-    from deepracer_exp.training.callback import TrainResult
+    from deepracer_exp.training.result import TrainResult
 
 _FILES = {
     REPORT: "findings and figures",

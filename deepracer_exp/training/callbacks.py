@@ -21,11 +21,11 @@ from deepracer_exp.tracking.projection import files_to_keep
 from deepracer_exp.tracking.tracker import FINISH_S, Tracker
 
 from .budget import Alerts
-from .callback import Callback, TrainResult
 from .display import ProgressDisplay, RunHeader
 from .machine import machine_use
 from .metrics import AMONG_OTHERS, NOT_EVALUATED, eval_columns
-from .trainer import Trainer
+from .result import TrainResult
+from .trainer import Callback, Trainer
 
 logger = logging.getLogger("deepracer_exp")
 

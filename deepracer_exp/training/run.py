@@ -54,15 +54,15 @@ from deepracer_exp.tracking.metrics import now_ms
 from deepracer_exp.tracking.tracking_file import TrackedRun, begin_again, read_tracked_run
 
 from .budget import Budget
-from .callback import Callback, TakenOver, TrainResult
 from .callbacks import standard_callbacks
 from .clone import describe_clone, read_parent
 from .machine import memory_needed
 from .metrics import track_names
 from .plan import ResumePlan, TrainPlan
+from .result import TakenOver, TrainResult
 from .rounding import rounded
 from .signals import Interruption
-from .trainer import Trainer
+from .trainer import Callback, Trainer
 
 logger = logging.getLogger("deepracer_exp")
 

@@ -1,4 +1,4 @@
-"""The trainer: the loop of a training."""
+"""The trainer: the loop of a training, and the hooks around it."""
 
 import contextlib
 import json
@@ -39,8 +39,8 @@ from deepracer_exp.sim.batch import cores
 
 from .best import BestPolicy
 from .budget import Budget
-from .callback import Callback, TrainResult
 from .metrics import NOT_EVALUATED, Finished, RunMetrics, track_names
+from .result import TrainResult
 from .rivals import RivalPool
 from .signals import Interruption
 
@@ -48,6 +48,50 @@ logger = logging.getLogger("deepracer_exp")
 
 _LAST_EVERY, _LAST_EVERY_S = 10, 5.0
 """Iterations and seconds after which there is a new checkpoint `last`, whichever comes first."""
+
+
+class Callback:
+    """Base class of everything that happens around the training loop; each hook does nothing unless overridden.
+
+    The trainer calls a hook of all its callbacks in the order of its list. A hook may read all public attributes of
+    the trainer, add columns to `trainer.row` (in `on_iteration_end`, ahead of the callback that records it), and call
+    `trainer.request_stop` and `trainer.request_save`. An exception from a hook ends the run as failed.
+    """
+
+    hurries_when_interrupted = False
+    """Leave out `on_train_end` when the run is interrupted, because another process resumes it at once."""
+
+    def on_replay(self, trainer: "Trainer") -> None:
+        """`trainer.row` is a row of metrics.jsonl that a resumed run has up to its checkpoint; called for each."""
+
+    def on_fit_start(self, trainer: "Trainer") -> None:
+        """The loop is about to start; a stop requested here ends it before any car drives.
+
+        What is entered into `trainer.running` here is left once the loop has ended, however it ended.
+        """
+
+    def on_iteration_end(self, trainer: "Trainer") -> None:
+        """The networks are updated and `trainer.row` is measured."""
+
+    def on_train_end(self, trainer: "Trainer") -> None:
+        """The run came to its end or was interrupted, but did not fail; its results are written next."""
+
+    def on_run_end(self, trainer: "Trainer", result: TrainResult) -> None:
+        """summary.json is written; the last hook of a run."""
+
+    def on_release(self, trainer: "Trainer") -> None:
+        """Another process has taken the run over: write nothing more. In place of `on_run_end`."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a resumed run needs: tensors, arrays and JSON types, under keys no other callback uses."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore from what all callbacks of the run have stored."""
+
+    def summary(self, trainer: "Trainer") -> dict[str, Any]:
+        """Return entries for summary.json, JSON types."""
+        return {}
 
 
 class Trainer:

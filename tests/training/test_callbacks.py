@@ -9,9 +9,10 @@ from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.files import read_metrics
 from deepracer_exp.runs.folder import RunFolder, is_held
 from deepracer_exp.runs.result import STOPPED_EARLY, fastest_reliable
-from deepracer_exp.training.callback import Callback, TakenOver
 from deepracer_exp.training.plan import plan_resume, plan_training
+from deepracer_exp.training.result import TakenOver
 from deepracer_exp.training.run import copy_run, run_training
+from deepracer_exp.training.trainer import Callback
 
 from .conftest import assert_same_run
 

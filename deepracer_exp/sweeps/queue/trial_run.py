@@ -38,10 +38,10 @@ from deepracer_exp.tracking.mlflow_process import RemoteRun
 from deepracer_exp.tracking.study_run import TRIAL, end_trial_run, open_trial_run
 from deepracer_exp.tracking.tracking_file import Status
 from deepracer_exp.training.budget import RunEnded
-from deepracer_exp.training.callback import Callback, TrainResult
 from deepracer_exp.training.plan import TrainPlan, plan_resume
+from deepracer_exp.training.result import TrainResult
 from deepracer_exp.training.run import copy_run, run_training
-from deepracer_exp.training.trainer import Trainer
+from deepracer_exp.training.trainer import Callback, Trainer
 
 from .claims import TrialClaims
 from .lease import Lease

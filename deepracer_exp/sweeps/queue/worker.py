@@ -15,7 +15,7 @@ from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.sweeps.search.pruners import build_pruner
 from deepracer_exp.sweeps.search.samplers import build_sampler
 from deepracer_exp.sweeps.trial import Interrupted, Trial
-from deepracer_exp.training.callback import TakenOver
+from deepracer_exp.training.result import TakenOver
 from deepracer_exp.training.signals import Interruption
 
 from .claims import Claim, TrialClaims, report_results
