@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from deepracer_exp.config.compose import Composition, compose_experiment
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.stored import request_evaluation
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.race_env import RaceEnv
 from deepracer_exp.env.rival import refuse_rivals
@@ -122,7 +123,7 @@ def evaluate(run: str | Path, *overrides: str) -> Evaluation:
         RunFailed: a car's state became NaN, or a file cannot be written.
     """
     quiet = Console(quiet=True)
-    return evaluate_run(plan_evaluation(str(run), overrides), None, quiet, quiet)
+    return evaluate_run(plan_evaluation(str(run), request_evaluation(overrides)), None, quiet, quiet)
 
 
 def load_policy(

@@ -172,9 +172,10 @@ def _check(args: argparse.Namespace) -> int:
 def _planned(
     args: argparse.Namespace, run: str, overrides: list[str], has_checkpoint: bool = True
 ) -> "EvaluatePlan":
+    from deepracer_exp.config.stored import request_evaluation
     from deepracer_exp.evaluation.plan import plan_evaluation
 
-    plan = plan_evaluation(run, overrides, has_checkpoint=has_checkpoint)
+    plan = plan_evaluation(run, request_evaluation(overrides), has_checkpoint=has_checkpoint)
     args.debug = plan.config.debug
     return plan
 

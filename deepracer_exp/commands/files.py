@@ -118,7 +118,8 @@ def _import_model(args: argparse.Namespace) -> int:
     import zipfile
 
     from deepracer_exp.lookup.next_steps import own_word
-    from deepracer_exp.training.import_model import import_model
+
+    from .import_model import import_model
 
     imported = import_model(args.path, args.name, args.overrides)
     print_notes(imported.notes)

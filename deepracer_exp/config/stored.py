@@ -2,17 +2,17 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from deepracer_exp.addresses import without_passwords
 from deepracer_exp.errors import BadInput, Unknown, nearest
 
 from . import acting, custom_files
-from .compose import Composition, check_names, compose_entry
+from .compose import Composition, check_names, compose_entry, compose_evaluation
 from .evaluation import EvaluateConfig, EvaluationConfig
 from .options import groups
-from .overrides import OPEN_MAPPINGS, parse_single
+from .overrides import OPEN_MAPPINGS, group_of, key_of, parse_single
 from .own_class import allow, allow_given
 from .parse import parse_config
 
@@ -83,23 +83,36 @@ def with_overrides(
     )
 
 
-def evaluate_as_stored(
-    request: Composition, protocol: EvaluationConfig, overrides: Sequence[str]
-) -> EvaluateConfig:
-    """Return a request of an evaluation by a stored run's protocol, with single values of it changed.
+@dataclass(frozen=True)
+class EvaluationRequest:
+    """An evaluation of a stored run, as asked for."""
 
-    Args:
-        request: as composed, with another protocol.
-        protocol: the run's.
-        overrides: of the protocol, such as ``evaluation.trials=20``.
+    config: EvaluateConfig
+    """All values; the protocol is the run's unless one is named."""
+    composition: Composition
+    changes: tuple[str, ...] | None
+    """Overrides of the run's protocol, such as ``evaluation.trials=20``; None: a protocol is named."""
 
-    Raises:
-        BadInput: an override cannot be parsed, names something unknown or gives a value that is not accepted.
-    """
-    changed = with_overrides({"evaluation": asdict(protocol)}, {}, overrides)
-    config = parse_config(request.mapping | changed.mapping, EvaluateConfig)
-    check_names(config.evaluation)
-    return config
+    def of_run(self, protocol: EvaluationConfig) -> EvaluateConfig:
+        """Return the request for a run that its training evaluates by a protocol.
+
+        Raises:
+            BadInput: a change names something unknown or gives a value that is not accepted.
+        """
+        if self.changes is None:
+            return self.config
+        changed = with_overrides({"evaluation": asdict(protocol)}, {}, self.changes)
+        config = parse_config(self.composition.mapping | changed.mapping, EvaluateConfig)
+        check_names(config.evaluation)
+        return config
+
+
+def request_evaluation(overrides: Sequence[str]) -> EvaluationRequest:
+    """Compose the overrides of a command that evaluates a stored run; raises as `compose_evaluation`."""
+    is_named = any(key_of(override) == "evaluation" for override in overrides)
+    changes = [] if is_named else [override for override in overrides if group_of(override) == "evaluation"]
+    config, composition = compose_evaluation([override for override in overrides if override not in changes])
+    return EvaluationRequest(config, composition, None if is_named else tuple(changes))
 
 
 def config_differences(configs: Sequence[Mapping[str, Any]], prefix: str = "") -> dict[str, list[Any]]:

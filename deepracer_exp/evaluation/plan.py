@@ -1,22 +1,17 @@
 """What a command that races a stored policy was asked, with the answers; nothing here imports PyTorch."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from deepracer_exp.config.compose import compose_evaluation
 from deepracer_exp.config.evaluation import EvaluateConfig
 from deepracer_exp.config.named import race_of
-from deepracer_exp.config.overrides import group_of, key_of
 from deepracer_exp.config.own_class import OF_POLICY
 from deepracer_exp.config.parse import import_own_classes
-from deepracer_exp.config.stored import evaluate_as_stored
+from deepracer_exp.config.stored import EvaluationRequest
 from deepracer_exp.env.real_car import require_car
 from deepracer_exp.errors import BadInput
 from deepracer_exp.lookup.resolve import StoredRun, resolve
 from deepracer_exp.lookup.rival import find_rival, kept_rival
-
-_PROTOCOL = "evaluation"
 
 
 @dataclass(frozen=True)
@@ -31,23 +26,19 @@ class EvaluatePlan:
     """The run, with its checkpoint, that drives the rival; None: there is none, or it is the policy itself."""
 
 
-def plan_evaluation(run: str, overrides: Sequence[str], *, has_checkpoint: bool = True) -> EvaluatePlan:
-    """Compose an evaluation, and find the run that it races, and its checkpoint if `has_checkpoint`.
+def plan_evaluation(run: str, request: EvaluationRequest, *, has_checkpoint: bool = True) -> EvaluatePlan:
+    """Find the run that an evaluation races, and its checkpoint if `has_checkpoint`.
 
     Raises:
-        BadInput: as for `compose_evaluation`, `evaluate_as_stored`, `resolve`, `StoredRun.with_policy` and
-            `find_rival`, a rival is named for a race without one, or the physical car could not run the policy.
+        BadInput: as for `EvaluationRequest.of_run`, `resolve`, `StoredRun.with_policy` and `find_rival`, a rival is
+            named for a race without one, or the physical car could not run the policy.
     """
-    is_named = any(key_of(override) == _PROTOCOL for override in overrides)
-    changes = [] if is_named else [override for override in overrides if group_of(override) == _PROTOCOL]
-    config, composition = compose_evaluation([override for override in overrides if override not in changes])
-    stored = resolve(run, Path(config.runs_dir), config.tracking.uri)
+    stored = resolve(run, Path(request.config.runs_dir), request.config.tracking.uri)
     if has_checkpoint:
-        stored = stored.with_policy(config.checkpoint)
+        stored = stored.with_policy(request.config.checkpoint)
     else:
         import_own_classes(stored.experiment, OF_POLICY)
-    if not is_named:
-        config = evaluate_as_stored(composition, stored.experiment.evaluation, changes)
+    config = request.of_run(stored.experiment.evaluation)
     if config.evaluation.real_car is not None:
         require_car(stored.experiment)
     return EvaluatePlan(stored, config, _rival(stored, config))

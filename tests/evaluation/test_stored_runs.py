@@ -11,6 +11,7 @@ import torch
 import yaml
 from rich.console import Console
 
+from deepracer_exp.config.stored import request_evaluation
 from deepracer_exp.evaluation.evaluate import results_table
 from deepracer_exp.evaluation.plan import plan_evaluation
 from deepracer_exp.evaluation.result import Evaluation
@@ -141,10 +142,14 @@ def test_a_run_is_evaluated_as_its_training_did_unless_a_protocol_is_named(run_d
     change_config(run_dir, "evaluation", trials=5, time_s=7.5)
     store = f"runs_dir={run_dir.parents[1]}"
     trained = resolve(str(run_dir), run_dir.parents[1], None).experiment.evaluation
-    assert plan_evaluation(str(run_dir), [store]).config.evaluation == trained
-    changed = plan_evaluation(str(run_dir), [store, "evaluation.seed=3"]).config.evaluation
+    assert plan_evaluation(str(run_dir), request_evaluation([store])).config.evaluation == trained
+    changed = plan_evaluation(
+        str(run_dir), request_evaluation([store, "evaluation.seed=3"])
+    ).config.evaluation
     assert (changed.trials, changed.time_s, changed.seed) == (5, 7.5, 3)
-    named = plan_evaluation(str(run_dir), [store, "evaluation=three_trials", "evaluation.seed=3"])
+    named = plan_evaluation(
+        str(run_dir), request_evaluation([store, "evaluation=three_trials", "evaluation.seed=3"])
+    )
     assert (named.config.evaluation.trials, named.config.evaluation.seed) == (3, 3)
 
 
