@@ -19,7 +19,7 @@ class FileOverrides:
     typed: tuple[str, ...]
     """The user's own, with `custom_files=DIR`."""
     lines: tuple[str, ...]
-    """Those of the files, then the user's own without `custom_files=DIR`."""
+    """The overrides of the files, then the user's own without `custom_files=DIR`."""
     names: Mapping[str, str]
     """Display names of the reward and the action space that come from the folder."""
     notes: tuple[str, ...]
@@ -34,13 +34,13 @@ def with_custom_files(overrides: Sequence[str]) -> FileOverrides:
     Raises:
         BadInput: an override cannot be parsed, or a file cannot be used.
     """
-    own = tuple(line for line in overrides if key_of(line) != KEY)
+    others = tuple(line for line in overrides if key_of(line) != KEY)
     folders = [parse_single(line).value() for line in overrides if key_of(line) == KEY]
     if not folders or folders[-1] is None:
-        return FileOverrides(tuple(overrides), own, {}, ())
-    typed = {parse_single(line).key_or_group: line for line in own}
+        return FileOverrides(tuple(overrides), others, {}, ())
+    typed = {parse_single(line).key_or_group: line for line in others}
     lines, names, notes = _file_overrides(read_custom_files(str(folders[-1])), typed)
-    return FileOverrides(tuple(overrides), (*lines, *own), names, tuple(notes))
+    return FileOverrides(tuple(overrides), (*lines, *others), names, tuple(notes))
 
 
 def _file_overrides(

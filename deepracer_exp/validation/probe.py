@@ -2,7 +2,7 @@
 
 import ast
 import operator
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any
@@ -80,8 +80,8 @@ class Probe:
     def _answers(self, calls: Iterable[dict[str, Any]]) -> list[Answer]:
         """Call the function with each params."""
         waiting = iter(calls)
-        found = [] if self.hangs else [self._answer(answer) for answer in self._until_it_hangs(waiting)]
-        return [*found, *(Answer(float("nan"), NOT_CALLED) for _ in waiting)]
+        answers = [] if self.hangs else [self._answer(answer) for answer in self._until_it_hangs(waiting)]
+        return [*answers, *(Answer(float("nan"), NOT_CALLED) for _ in waiting)]
 
     def _until_it_hangs(self, calls: Iterator[dict[str, Any]]) -> Iterator[float | Failure]:
         for answer in self._function.answers(calls):
