@@ -22,7 +22,6 @@ with ending_at_once():
     from deepracer_exp.addresses import redact, without_passwords
     from deepracer_exp.commands import actions, analyze, compare, evaluate, files, runs, tracks, train
     from deepracer_exp.errors import BadInput, RunFailed, nearest
-    from deepracer_exp.lean_imports import import_lean
     from deepracer_exp.lifeline import die_with_parent, guard_imports
     from deepracer_exp.scratch import own_scratch
     from deepracer_exp.streams import Output, exit_code, standard_streams
@@ -54,7 +53,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
             sys.exit(_call(_parsed(words, output), output))
         with ending_at_once():
             guard_imports()
-            import_lean()
             sys.argv[1:] = words  # the run's folder keeps them
             args = _parsed(words, output, has_own_process=True)
             own_scratch()

@@ -7,7 +7,6 @@ need, which takes many seconds on a busy machine.
 import os
 from pathlib import Path
 
-from deepracer_exp.lean_imports import import_lean
 from deepracer_exp.lifeline import kill_when_closed
 
 # Its clients hold the other end; it is the only pipe that the server is given (multiprocessing.forkserver).
@@ -15,4 +14,3 @@ from deepracer_exp.lifeline import kill_when_closed
     int(path.name) for path in Path("/proc/self/fd").iterdir() if int(path.name) > 2 and path.is_fifo()
 )
 kill_when_closed(_clients, os.getpid())
-import_lean()
