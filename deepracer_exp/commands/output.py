@@ -1,5 +1,6 @@
 """What commands print: consoles, warnings, and the result of a run."""
 
+import functools
 import logging
 import shlex
 import shutil
@@ -9,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from deepracer_exp.cache import compiled_folder
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.runs.files import BEST_LAP, CHECKPOINTS, LEARNING, METRICS, REPORT, full_name, read_metrics
 from deepracer_exp.runs.result import FAILED, RELIABLE, TRAINING_LAPS, fastest_reliable, why_not_fastest
@@ -81,6 +83,7 @@ def print_table(console: "Console", title: str | None, table: "Table") -> None:
 @contextmanager
 def warnings_on_stderr() -> Iterator[None]:
     """Write the project's warnings to standard error within the block, one line each."""
+    warn_of_compiling()
     handler = logging.StreamHandler(sys.stderr)
     # Errors are the command's own to print, in one line; here they would come with a traceback.
     handler.addFilter(lambda record: record.levelno == logging.WARNING)
@@ -101,11 +104,26 @@ def print_notes(notes: Iterable[str]) -> None:
 
 def print_start() -> None:
     """Say what takes the seconds before the first car drives."""
+    warn_of_compiling()
     what = "starting: loading PyTorch and MuJoCo"
-    # Where numba keeps what it has compiled; the package itself is not imported yet.
-    if not any(Path(__file__).parents[1].glob("sim/__pycache__/tyres.*.nbi")):
+    if is_compiled_first("tyres"):
         what += ", and compiling the physics, once after an installation (about 20 s)"
     print(what, file=sys.stderr, flush=True)
+
+
+def is_compiled_first(module: str) -> bool:
+    """Return whether the functions of a module, by its file's name, are compiled once and have not been yet."""
+    folder = compiled_folder()
+    # Where numba keeps what it has compiled; numba itself is not imported yet.
+    return folder is not None and not any(folder.glob(f"*/{module}.*.nbi"))
+
+
+@functools.cache
+def warn_of_compiling() -> None:
+    """Say once that compiled code cannot be kept, where this is so."""
+    if compiled_folder() is None:
+        why = "NUMBA_CACHE_DIR, XDG_CACHE_HOME or HOME names no folder that can be written"
+        print(f"warning: each command compiles the physics again, for about 20 s: {why}", file=sys.stderr)
 
 
 def print_result(outcome: "TrainResult", tracking: "TrackingConfig") -> None:

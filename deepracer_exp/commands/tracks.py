@@ -10,7 +10,14 @@ from deepracer_exp.errors import BadInput, count, writing
 from .arguments import add_command, add_overrides, is_override
 from .evaluate import choose_graphics
 from .files import picture_file
-from .output import check_file, plain_console, print_notes, table_console
+from .output import (
+    check_file,
+    is_compiled_first,
+    plain_console,
+    print_notes,
+    table_console,
+    warn_of_compiling,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -194,8 +201,8 @@ def search_fastest(experiment: "Experiment", track: "Track") -> "FastestLap":
     if kept is not None:
         return kept
     console, rounds = plain_console(stderr=True), count(len(PASSES), "round")
-    # Where numba keeps what it has compiled.
-    if not any(Path(__file__).parents[1].glob("fastest/__pycache__/optimal_control.*.nbi")):
+    warn_of_compiling()
+    if is_compiled_first("optimal_control"):
         rounds += "; the search is compiled first, once after an installation (about a minute)"
     console.print(
         f"searching the fastest lap of {experiment.car.name} on {track.title} in {rounds}", soft_wrap=True

@@ -8,7 +8,6 @@ which the commands of the lap are free.
 import hashlib
 import json
 import math
-import os
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from deepracer_exp.cache import cache_home
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.named import no_randomization
@@ -263,8 +263,5 @@ def _keep(question: Question, lap: FastestLap) -> None:
 
 def _file(question: Question) -> Path | None:
     """Return where a lap is kept; None where this account has no home."""
-    try:
-        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    except RuntimeError:
-        return None
-    return Path(base) / "deepracer_exp" / "fastest_laps" / f"{question.key}.json"
+    folder = cache_home()
+    return None if folder is None else folder / "fastest_laps" / f"{question.key}.json"

@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 import mujoco
 import mujoco.batch
 import numpy as np
-from numba import cfunc
 from numpy.typing import ArrayLike, NDArray
 
-from deepracer_exp.compiled import njit
+from deepracer_exp.compiled import cfunc, njit
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.errors import RunFailed
 

@@ -3,9 +3,9 @@ import warnings
 
 import numpy as np
 import pytest
+from numba import njit
 
 from deepracer_exp.commands.tracks import search_fastest
-from deepracer_exp.compiled import njit
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.rules import lap_clock_s
 from deepracer_exp.errors import BadInput, RunFailed
