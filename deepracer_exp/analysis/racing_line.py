@@ -5,6 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 import shapely
+from scipy.optimize import lsq_linear
 
 from deepracer_exp.tracks.track import Track
 
@@ -18,10 +19,6 @@ MOST = 200
 """Points of a line; the computing time grows with their cube."""
 ROUNDS = 5
 """Each round goes half of the way to its solution, which keeps the line from oscillating; five go 97 per cent."""
-_MOST_STEPS, _EXACT_M = 200, 1e-6
-"""Newton steps of a round at most, and the metres of the last one."""
-_DESCENT = 1e-4
-"""Share of the decrease that its slope promises by which a step must lower the sum of squares."""
 WHEELBASE_M = 0.164
 """Wheelbase of every car of the service (deepracer-simapp urdf/deepracer)."""
 
@@ -73,47 +70,16 @@ def minimum_curvature_line(course: Track) -> Line:
     sideways = _turned_left(along) / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
     right_m, left_m = _road_across(course, center, sideways)
     bounds = np.minimum(right_m + MARGIN_M, -1e-6), np.maximum(left_m - MARGIN_M, 1e-6)
-    offset_m = wanted_m = np.zeros(len(center))
+    offset_m = np.zeros(len(center))
     for _ in range(ROUNDS):
         velocity = first @ (center + offset_m[:, None] * sideways)
         pace = np.maximum(np.linalg.norm(velocity, axis=1), 1e-9)
         # n / pace**2 turns a second difference into curvature; sqrt(pace) weights the sum by length.
         weight = _turned_left(velocity) / pace[:, None] ** 2.5
         matrix = weight[:, :1] * second * sideways[:, 0] + weight[:, 1:] * second * sideways[:, 1]
-        wanted_m = bounded_least_squares(matrix, -(weight * (second @ center)).sum(axis=1), bounds, wanted_m)
+        wanted_m = lsq_linear(matrix, -(weight * (second @ center)).sum(axis=1), bounds).x
         offset_m = 0.5 * (offset_m + wanted_m)
     return _line(course, lap_position, offset_m, center + offset_m[:, None] * sideways)
-
-
-def bounded_least_squares(
-    matrix: Values, right: Values, bounds: tuple[Values, Values], start: Values
-) -> Values:
-    """Return the x (n,) within bounds, both (n,), for which matrix @ x, (m, n) times (n,), is nearest to right (m,).
-
-    Projected Newton steps (Bertsekas 1982, SIAM J. Control and Optimization 20) from `start`, which are exact once they
-    hold the right values at their bounds. SciPy's `lsq_linear` takes longer, and to be imported a quarter of a second.
-    """
-    product, slope_at_0 = matrix.T @ matrix, -(matrix.T @ right)
-    # Where values can change together at no cost, as along a straight, they stay.
-    product[np.diag_indices_from(product)] *= 1.0 + 1e-12
-    low, high = bounds
-    solution = np.clip(start, low, high)
-    for _ in range(_MOST_STEPS):
-        slope = product @ solution + slope_at_0
-        held = ((solution <= low) & (slope > 0.0)) | ((solution >= high) & (slope < 0.0))
-        free = np.flatnonzero(~held)
-        step = np.zeros(len(solution))
-        step[free] = np.linalg.solve(product[np.ix_(free, free)], -slope[free])
-        before, share = solution, 1.0
-        while share > _EXACT_M:
-            solution = np.clip(before + share * step, low, high)
-            moved = solution - before
-            if slope @ moved + 0.5 * moved @ product @ moved <= _DESCENT * slope @ moved:
-                break
-            share /= 2.0
-        if np.abs(solution - before).max() < _EXACT_M:
-            break
-    return solution
 
 
 def _places(course: Track) -> Values:

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.optimize import lsq_linear
 
 from deepracer_exp.analysis.charts.actions import (
     action_classes,
@@ -33,7 +32,6 @@ from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.off_track import risk_counts
 from deepracer_exp.analysis.racing_line import (
     MARGIN_M,
-    bounded_least_squares,
     center_line,
     minimum_curvature_line,
 )
@@ -249,19 +247,3 @@ def test_terms_are_shown_with_their_sum(view: LogView) -> None:
         np.testing.assert_allclose(line.y[np.isfinite(line.y)], value)
     assert drawn(chart).data
     assert reward_terms(view, terms.iloc[:0]) is None
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_bounded_least_squares_finds_the_minimum_that_scipy_finds(seed):
-    dice = np.random.default_rng(seed)
-    matrix, right = dice.normal(size=(60, 40)), dice.normal(size=60)
-    low, high = -dice.uniform(0.01, 0.2, 40), dice.uniform(0.01, 0.2, 40)
-    found = bounded_least_squares(matrix, right, (low, high), dice.uniform(-1, 1, 40))
-    np.testing.assert_allclose(found, lsq_linear(matrix, right, (low, high), tol=1e-14).x, atol=1e-6)
-    assert ((found == low) | (found == high)).sum() > 5
-
-
-def test_where_nothing_is_to_be_gained_the_racing_line_stays_in_the_middle():
-    matrix = np.array([[1.0, -2.0, 1.0]])
-    found = bounded_least_squares(matrix, np.zeros(1), (-np.ones(3), np.ones(3)), np.zeros(3))
-    np.testing.assert_array_equal(found, np.zeros(3))
