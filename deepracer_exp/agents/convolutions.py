@@ -68,7 +68,8 @@ class _InParts(torch.autograd.Function):
 
         first, *others = _in_turns(by_weights, list(zip(ctx.parts, gradient.split(PART), strict=True)))
         for other in others:
-            torch._foreach_add_(first, other)
+            for gradient, part in zip(first, other, strict=True):
+                gradient += part
         return None, None, None, *first
 
 
@@ -90,7 +91,10 @@ def _convolve(layers: nn.Sequential, pictures: Tensor, dtype: torch.dtype) -> Te
 
 
 def _blocks(pictures: Tensor, size: int) -> Tensor:
-    """Return [n, channels * size * size, height / size, width / size] of bytes, channels last."""
+    """Return [n, channels * size * size, height / size, width / size] of bytes, channels last.
+
+    They are those of PyTorch's `pixel_unshuffle`, which takes eight times as long for bytes: a fifth of an update.
+    """
     count, channels, height, width = pictures.shape
     rows = pictures.contiguous()
     rows = (
@@ -106,10 +110,7 @@ def _blocks(pictures: Tensor, size: int) -> Tensor:
 def _of_blocks(weight: Tensor, size: int) -> Tensor:
     """Return a kernel for `_blocks`, padded to whole ones, [filters, channels * size * size, rows, columns]."""
     missing = -weight.shape[-1] % size
-    weight = functional.pad(weight, (0, missing, 0, missing))
-    filters, channels, height, width = weight.shape
-    blocks = weight.view(filters, channels, height // size, size, width // size, size)
-    return blocks.permute(0, 1, 3, 5, 2, 4).reshape(filters, -1, height // size, width // size)
+    return functional.pixel_unshuffle(functional.pad(weight, (0, missing, 0, missing)), size)
 
 
 def _in_turns(function: Callable[[_T], _R], parts: Sequence[_T]) -> list[_R]:

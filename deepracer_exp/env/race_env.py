@@ -119,13 +119,13 @@ class RaceEnv(EnvBase):
         flags = {key: self._no.clone() for key in _FLAGS}
         seen = {key: torch.from_numpy(values) for key, values in self.seen.items()}
         seen["trace"] = torch.from_numpy(self.race.trace.copy())
-        return TensorDict._new_unsafe({**seen, **flags}, batch_size=self.batch_size, device=self.device)
+        return TensorDict({**seen, **flags}, batch_size=self.batch_size, device=self.device)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         following = self.drive(tensordict.get("action").detach().numpy())
         following["trace"] = following["trace"].copy()
         tensors = {key: torch.from_numpy(values) for key, values in following.items()}
-        return TensorDict._new_unsafe(tensors, batch_size=self.batch_size, device=self.device)
+        return TensorDict(tensors, batch_size=self.batch_size, device=self.device)
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:

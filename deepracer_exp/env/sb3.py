@@ -90,4 +90,6 @@ class DeepRacerVecEnv(VecEnv):
         return [False] * len(self._chosen(indices))
 
     def _chosen(self, indices: int | Iterable[int] | None) -> list[int]:
-        return list(self._get_indices(indices))
+        if indices is None:
+            return list(range(self.num_envs))
+        return [indices] if isinstance(indices, int) else list(indices)

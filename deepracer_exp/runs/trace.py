@@ -306,9 +306,8 @@ def stored_values(
         return words if rows is None else words.take(rows)
     if pa.types.is_decimal(kind):
         # Arrow divides each number by itself, which takes fifty times as long.
-        whole = column.combine_chunks()
-        digits = np.frombuffer(whole.buffers()[1], np.dtype(f"i{kind.byte_width}"))
-        values: NDArray[Any] = digits[whole.offset : whole.offset + len(whole)] / 10.0**kind.scale
+        digits = column.combine_chunks().view(f"int{kind.bit_width}")
+        values: NDArray[Any] = digits.to_numpy(zero_copy_only=False) / 10.0**kind.scale
     else:
         values = column.to_numpy()
     return values if rows is None else values[rows]
