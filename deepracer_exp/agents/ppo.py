@@ -191,9 +191,7 @@ class PPO(Algorithm):
         ends = batch["next", "done"].squeeze(-1).clone()
         ends[..., -1] = True
         next_value = value.roll(-1, dims=-2)
-        # Tensor by tensor: TensorDict's index would import SymPy.
-        last = {key: batch["next", key][ends] for key in self._learner.value.in_keys}
-        next_value[ends] = self._value_of(TensorDict(last, [int(ends.sum())]))
+        next_value[ends] = self._value_of(batch["next"].select(*self._learner.value.in_keys)[ends])
         estimates = TensorDict(
             {
                 "state_value": value,

@@ -37,12 +37,18 @@ class DeepRacerVecEnv(VecEnv):
         """Put the cars on the track; arguments and errors as for `DeepRacerVectorEnv`."""
         self.cars = DeepRacerVectorEnv(num_envs, overrides, threads, setup, render_mode)
         super().__init__(num_envs, self.cars.single_observation_space, self.cars.single_action_space)
+        self._first_seed: int | None = None
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Have the next reset start over from a seed, or from a random one; return the seeds, one a car."""
+        seeds: Sequence[int | None] = super().seed(seed)
+        self._first_seed = seeds[0]
+        return seeds
 
     def reset(self) -> Observed:
         """Start an episode with every car; after `seed(S)`, start over from S."""
-        observation, _ = self.cars.reset(seed=self._seeds[0])
-        self._reset_seeds()
-        self._reset_options()
+        observation, _ = self.cars.reset(seed=self._first_seed)
+        self._first_seed = None
         return observation
 
     def step_async(self, actions: NDArray[Any]) -> None:
