@@ -222,7 +222,9 @@ class SensorNet(nn.Module):
         size, hidden = 0, config.hidden
         self.has_action = actions > 0
         self.has_picture, self.has_lidar = observed.picture is not None, observed.lidar is not None
-        self.half_precision: bool = self.has_picture and torch.cpu.get_capabilities().get("avx512_bf16", False)
+        self.half_precision: bool = self.has_picture and torch.cpu.get_capabilities().get(
+            "avx512_bf16", False
+        )
         if observed.picture is not None:
             channels, *pixels = observed.picture
             layers: list[nn.Module] = []
