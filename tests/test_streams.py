@@ -42,19 +42,16 @@ def test_a_reader_that_has_left_is_no_error_of_ours(tmp_path, closed_pipe):
     assert (done.returncode, done.stderr) == (141, "")
 
 
-def test_a_command_that_runs_rewards_does_not_blame_them_for_its_lost_output(tmp_path, closed_pipe):
+def test_what_cannot_be_read_any_more_does_not_end_a_command_halfway(tmp_path, closed_pipe):
     code = """
 import sys
-from deepracer_exp.cli import supervised
 from deepracer_exp.commands.terminal import Terminal
 from deepracer_exp.streams import exit_code, standard_streams
-def call():
+with standard_streams() as output:
     for _ in range(100):
         Terminal().print("x" * 100)
     print("done", file=sys.stderr)
-    return exit_code(output, 0)
-with standard_streams() as output:
-    sys.exit(supervised(call))
+    sys.exit(exit_code(output, 0))
 """
     done = run((sys.executable, "-c", code), tmp_path, stdout=closed_pipe)
     assert (done.returncode, done.stderr) == (141, "done\n")
@@ -67,7 +64,7 @@ def test_closed_streams_are_no_matter(tmp_path, closed):
 
 
 @pytest.mark.parametrize("module", ["deepracer_exp.commands.train", "rich.console", "rich.table"])
-def test_ctrl_c_during_imports_is_quiet(tmp_path, module):
+def test_ctrl_c_during_imports_takes_one_line(tmp_path, module):
     code = f"""
 import os, signal, sys
 class Press:
@@ -80,7 +77,7 @@ from deepracer_exp.cli import main
 main()
 """
     done = run((sys.executable, "-c", code), tmp_path, stdout=subprocess.PIPE)
-    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "deepracer-exp: interrupted\n")
 
 
 @pytest.fixture

@@ -47,7 +47,6 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         description="Read the logs of a training, ours or the service's of any year, print the findings, and write a "
         "page of figures.",
         epilog=_EPILOG,
-        runs_rewards=True,
     )
     add_run(
         parser,

@@ -43,7 +43,6 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
             "floor, heavy car, delayed actions, ...), on any tracks."
         ),
         epilog=_EVALUATE_EPILOG,
-        runs_rewards=True,
         entry="evaluate",
     )
     add_run(parser, "checkpoint=NAME | evaluation=NAME | KEY=VALUE")
@@ -66,7 +65,6 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
             "line is `ready`, or says what to do."
         ),
         epilog=_CHECK_EPILOG,
-        runs_rewards=True,
         entry="evaluate",
     )
     add_run(parser, "checkpoint=NAME | evaluation.KEY=VALUE | KEY=VALUE")
@@ -88,7 +86,6 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
             "evaluation laps of a training while it runs, until Ctrl-C."
         ),
         epilog=_WATCH_EPILOG,
-        runs_rewards=True,
         entry="evaluate",
     )
     add_run(parser, "checkpoint=NAME | evaluation=NAME | KEY=VALUE", many=True)

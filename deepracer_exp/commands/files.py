@@ -26,7 +26,6 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
             "pays for, and warn of common mistakes."
         ),
         epilog=_VALIDATE_EPILOG,
-        runs_rewards=True,
     )
     add_overrides(parser, "reward=NAME | reward.file=PATH | KEY=VALUE")
     parser.add_argument(

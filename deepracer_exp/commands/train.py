@@ -66,7 +66,6 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         help="train a car",
         description="Train a car: compose an experiment from overrides and run it.",
         epilog=_TRAIN_EPILOG,
-        runs_rewards=True,
     )
     add_overrides(parser, "GROUP=OPTION | KEY=VALUE")
     parser.add_argument("--cfg", action="store_true", help="print the composed experiment as YAML and stop")
@@ -83,7 +82,6 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         help="continue a run that was killed, interrupted or failed",
         description="Continue a run from its last checkpoint.",
         epilog=_RESUME_EPILOG,
-        runs_rewards=True,
     )
     add_run(parser)
 
@@ -95,7 +93,6 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         description="Continue from another run's checkpoint in a new run, at a tenth of its learning rate unless "
         "another one is given.",
         epilog=_CLONE_EPILOG,
-        runs_rewards=True,
     )
     add_run(parser, "checkpoint=NAME | GROUP=OPTION | KEY=VALUE")
 
@@ -106,7 +103,6 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         help="search for the values that race best",
         description="Train many cars, each with other values, and find the best.",
         epilog=_SWEEP_EPILOG,
-        runs_rewards=True,
         entry="sweep",
     )
     add_overrides(parser, "KEY=EXPRESSION | GROUP=OPTION | KEY=VALUE | report NAME | best NAME")
@@ -114,10 +110,6 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def _train(args: argparse.Namespace) -> int:
-    # Most trainings want workers, which begin to import before it is known; `main` called by a program waits for it.
-    if args.has_own_process and args.options is None and not args.cfg:
-        start_workers_early("collector=in_process" not in args.overrides)
-
     from deepracer_exp.config.compose import compose_experiment, expand_grid
     from deepracer_exp.config.options import options_of
 
@@ -261,9 +253,6 @@ _WORKER = "deepracer_exp.sweeps.queue.worker"
 def _sweep(args: argparse.Namespace) -> int:
     if args.overrides and args.overrides[0] in _WORDS:
         return _show_study(*args.overrides)
-    if args.has_own_process and not args.cfg:
-        start_workers_early("sweep/executor=ray" not in args.overrides, _WORKER)
-
     from deepracer_exp.sweeps.plan import plan_sweep
 
     plan = plan_sweep(args.overrides, is_only_shown=args.cfg)

@@ -20,36 +20,18 @@ def reward_function(params):
 """Never returns to the interpreter, which alone could raise an error; a loop that catches all may be left some time."""
 
 
-WHEN = {
-    "load": "import os\nos._exit(0)\ndef reward_function(params):\n    return 1.0\n",
-    "call": "import os\ndef reward_function(params):\n    os._exit(0)\n",
-}
-"""A reward function that leaves the process, by when it does."""
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("when", WHEN)
-@pytest.mark.parametrize("command", ["train", "train in workers", "validate", "analyze", "sweep"])
-def test_a_reward_that_leaves_the_process_never_ends_a_command_with_0(
-    run_at, trained, tmp_path, command, when
-):
-    file = tmp_path / "leaves.py"
-    file.write_text(WHEN[when])
-    match command:
-        case "validate":
-            arguments = ["validate", f"reward.file={file}"]
-        case "analyze":
-            arguments = ["analyze", str(trained().folder), "--output", "page.html", "--reward", str(file)]
-        case "sweep":
-            tiny = ("experiment=tiny", "tracking=off", "sweep.trials=1", "sweep.workers=1")
-            arguments = ["sweep", *tiny, "algorithm.lr=1e-3,1e-4", f"reward.file={file}"]
-        case _:
-            mode = "sync" if "workers" in command else "in_process"
-            tiny = ("experiment=tiny", "tracking=off", f"collector={mode}", "collector.processes=null")
-            arguments = ["train", *tiny, f"reward.file={file}"]
-    ended = run_at(tmp_path, *arguments)
+@pytest.mark.parametrize("command", ["train", "sweep"])
+def test_a_reward_that_ends_a_worker_never_ends_a_command_with_0(run_at, tmp_path, command):
+    (tmp_path / "leaves.py").write_text("import os\ndef reward_function(params):\n    os._exit(0)\n")
+    tiny = ["experiment=tiny", "tracking=off", "reward.file=leaves.py"]
+    if command == "train":
+        tiny += ["collector=sync", "collector.processes=null"]
+    else:
+        tiny += ["sweep.trials=1", "sweep.workers=1", "algorithm.lr=1e-3,1e-4"]
+    ended = run_at(tmp_path, command, *tiny)
     assert ended.code == 3
-    assert "exit code 0" in ended.complaint or (command, when) == ("sweep", "call")
+    assert "exit code 0" in ended.complaint or command == "sweep"
     assert not list(tmp_path.glob("runs/*/*/summary.json")) or ended.summary["status"] == "failed"
 
 
