@@ -10,7 +10,7 @@ A step is one control step (1/15 s) of one car. Everything is the default experi
 - `env_steps_per_s`: `RaceEnv`, one thread, 256 cars, random actions drawn beforehand, a scalar reward function (the
   experiment's without its `reward_batch`), episodes begun again as they end.
 - `all_tracks_over_one_env` (a ratio): the same on eighteen tracks at once, over the figure on one track.
-- `collect_steps_per_s`: batches of an iteration's frames through `LocalCollector` in sync mode with 1 and 2 worker
+- `collect_steps_per_s`: batches of an iteration's frames through `Collector` in sync mode with 1 and 2 worker
   processes, the experiment's cars, its network sampling actions with its first weights.
 - `train_steps_per_s`: `deepracer-exp train` as a process of its own without MLflow: collection, update, trace, metrics,
   checkpoints. Start-up and the first iteration are left out: env_steps over wall_clock_s between the first and the
@@ -43,7 +43,7 @@ import numpy as np
 import torch
 
 from deepracer_exp.agents.build import build_networks
-from deepracer_exp.collectors.collector import LocalCollector
+from deepracer_exp.collectors.collector import Collector
 from deepracer_exp.collectors.forking import start_workers_early
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.driving import RewardConfig
@@ -211,18 +211,18 @@ def collecting(experiment: Experiment, rounds: int, seconds: float, folder: Path
         experiment.network, experiment.algorithm, observed, setup.actions.n, generator
     ).policy
 
-    def start(processes: int) -> LocalCollector:
+    def start(processes: int) -> Collector:
         config = dataclasses.replace(experiment.collector, mode="sync", processes=processes)
         run_dir = folder / f"collect_{processes}"
         run_dir.mkdir()
-        return LocalCollector(config, setup, policy, frames, run_dir)
+        return Collector(config, setup, policy, frames, run_dir)
 
     with start(1) as one, start(2) as two:
         passes: dict[str, Callable[[], tuple[float, float]]] = {}
         for name, collection in (("collect 1", one), ("collect 2", two)):
             collection.next_batch()  # imports, compilation and the first episodes' common start
 
-            def one_batch(batches: LocalCollector = collection) -> tuple[float, float]:
+            def one_batch(batches: Collector = collection) -> tuple[float, float]:
                 began = time.perf_counter()
                 steps = batches.next_batch().numel()
                 return steps, time.perf_counter() - began

@@ -1,9 +1,8 @@
 """Processes that end with their owner, the process that started them, however that one dies.
 
-The owner alone holds the writing end of a pipe, and what it started holds the reading end. When the owner is gone, its
-end is closed, and the kernel kills the process at the other end at once, even one that hangs or is stopped (fcntl(2),
-F_SETSIG and F_SETOWN: Linux only; elsewhere a thread waits for the owner). PR_SET_PDEATHSIG alone would not do: it
-watches the process that forked, which for a worker is a fork server that its workers keep alive.
+A worker is killed by the kernel when its parent dies (prctl(2), PR_SET_PDEATHSIG), even one that hangs or is stopped.
+Its parent is the fork server, which dies in the same way with the owner that started it. A thread of the worker waits
+for the owner, too, for systems other than Linux.
 """
 
 import ctypes
@@ -16,7 +15,6 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from multiprocessing.connection import wait
 from typing import Any
 
 _IS_LINUX = sys.platform == "linux"
@@ -38,55 +36,34 @@ def given_environment() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if name != _SAFE_PATH} | variables
 
 
-def kill_when_closed(pipe: int, target: int) -> None:
-    """Have a process killed once the writing end of a pipe is closed.
-
-    Args:
-        pipe: reading end, with nothing left to read; the target must keep it open.
-        target: id of the process; negative: of a process group, all of which is killed.
-    """
-    fcntl.fcntl(pipe, fcntl.F_SETOWN, target)
-    fcntl.fcntl(pipe, fcntl.F_SETSIG, signal.SIGKILL)
-    fcntl.fcntl(pipe, fcntl.F_SETFL, fcntl.fcntl(pipe, fcntl.F_GETFL) | os.O_ASYNC)
-    if wait([pipe], timeout=0):  # closed before the kernel was asked to look
-        os.kill(target, signal.SIGKILL)
-
-
 def die_with_parent() -> None:
-    """Have this process killed once the thread that forked it is gone: for a parent that forks from its main thread."""
+    """Have the kernel kill this process once the thread that started it is gone; of no effect but on Linux.
+
+    So its parent must start it from the main thread.
+    """
     if _IS_LINUX:
         PR_SET_PDEATHSIG = 1
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def end_with_owner() -> None:
-    """End this process, which `multiprocessing` started, with the one that started it.
-
-    One that was forked from a fork server ends with that server, too: only the server could report its end to the
-    owner.
-    """
+    """End this process, which `multiprocessing` started, with the one that started it, and with its fork server."""
     owner = multiprocessing.parent_process()
     assert owner is not None
-    if not _IS_LINUX:
 
-        def follow() -> None:
-            owner.join()
-            os.kill(os.getpid(), signal.SIGKILL)
+    def follow() -> None:
+        owner.join()  # returns at once if the owner died before the kernel was asked
+        os.kill(os.getpid(), signal.SIGKILL)
 
-        threading.Thread(target=follow, name="owner", daemon=True).start()
-        return
-    if os.getppid() != owner.pid:
-        die_with_parent()
-    kill_when_closed(owner.sentinel, os.getpid())
+    die_with_parent()
+    threading.Thread(target=follow, name="owner", daemon=True).start()
 
 
 @contextmanager
 def running(command: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[bytes]]:
     """Run a program, in a session of its own, that ends with the block or with this process, whichever is first.
 
-    The program runs in a session of its own; `options` are those of `subprocess.Popen`.
-
-    All that the program has started in its process group ends with it.
+    All that the program has started in its process group ends with it. `options` are those of `subprocess.Popen`.
 
     Raises:
         OSError: it cannot be run.
@@ -96,7 +73,12 @@ def running(command: Sequence[str], **options: Any) -> Iterator[subprocess.Popen
         with subprocess.Popen(command, start_new_session=True, pass_fds=[reading], **options) as process:
             try:
                 if _IS_LINUX:
-                    kill_when_closed(reading, -process.pid)
+                    # This process alone holds the writing end. Once it is closed, the kernel kills the group.
+                    # PR_SET_PDEATHSIG would leave what the program has started, such as MLflow's server below its
+                    # command, and would end the program with the thread that started it.
+                    fcntl.fcntl(reading, fcntl.F_SETOWN, -process.pid)
+                    fcntl.fcntl(reading, fcntl.F_SETSIG, signal.SIGKILL)
+                    fcntl.fcntl(reading, fcntl.F_SETFL, fcntl.fcntl(reading, fcntl.F_GETFL) | os.O_ASYNC)
                 yield process
             finally:
                 with suppress(ProcessLookupError):

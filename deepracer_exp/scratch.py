@@ -1,23 +1,19 @@
-"""What a command keeps outside of its run folder while it runs: temporary files and named semaphores.
+"""What a command keeps outside of its run folder while it runs: temporary files.
 
-They lie in a folder of the command's own, or carry its name, so that the next command can clear away what a killed one
-has left.
+They lie in a folder of the command's own, so that the next command can clear away what a killed one has left.
 """
 
+import atexit
 import fcntl
-import multiprocessing
 import os
 import shutil
-import sys
 import tempfile
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from multiprocessing import util
 from pathlib import Path
 
 _PREFIX = "deepracer_exp-"
-_SHARED_MEMORY = Path("/dev/shm")
 _LONGEST_BASE = 50
 """Bytes of the path above: the name of a fork server's socket, 55 below it, has at most 107 (unix(7))."""
 
@@ -35,11 +31,8 @@ def own_scratch() -> None:
     with suppress(OSError):
         folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=base))
         _hold(folder)
-        # After multiprocessing has removed its own (-100), and in this process, not in one that it forked.
-        util.Finalize(None, shutil.rmtree, (folder, True), exitpriority=-200)
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
         tempfile.tempdir = str(folder)
-        if sys.platform == "linux":  # elsewhere the name is too long
-            multiprocessing.current_process()._config["semprefix"] = f"/{folder.name}"  # type: ignore[attr-defined]
 
 
 @contextmanager
@@ -63,7 +56,7 @@ def folder_aside(parent: Path, prefix: str) -> Iterator[Path]:
 
 
 def clear(parent: Path, prefix: str) -> None:
-    """Remove the folders of this user whose names begin so and that no process holds, with their semaphores."""
+    """Remove the folders of this user whose names begin so and that no process holds."""
     for folder in parent.iterdir():
         if not folder.name.startswith(prefix):
             continue
@@ -72,17 +65,9 @@ def clear(parent: Path, prefix: str) -> None:
             try:
                 if os.fstat(opened).st_uid == os.getuid():
                     fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    _remove_semaphores(folder.name)
                     shutil.rmtree(folder)
             finally:
                 os.close(opened)
-
-
-def _remove_semaphores(folder_name: str) -> None:
-    # Not by a pattern: the folder's name may hold any characters.
-    for semaphore in _SHARED_MEMORY.iterdir() if _SHARED_MEMORY.is_dir() else ():
-        if semaphore.name.startswith(f"sem.{folder_name}-"):
-            semaphore.unlink()
 
 
 def _hold(folder: Path) -> int:

@@ -1,31 +1,31 @@
 """Batches of driving, from cars in this process or in several."""
 
 import contextlib
+import copy
 import functools
 import multiprocessing
 import signal
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, wait
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import MultiSyncCollector
-from torchrl.weight_update import SharedMemWeightSyncScheme
 
 from deepracer_exp.config.learning import AlgorithmConfig
 from deepracer_exp.config.running import CollectorConfig
-from deepracer_exp.env.head_to_head import Rivals, Weights
+from deepracer_exp.env.head_to_head import Rivals, Weights, weights_of
 from deepracer_exp.env.setup import RaceSetup
-from deepracer_exp.errors import RunFailed
+from deepracer_exp.errors import BadInput, RunFailed, count
 from deepracer_exp.patience import wait_patiently
 from deepracer_exp.runs.crash_dump import read_crash_dump
 from deepracer_exp.runs.files import HEARTBEAT, LOG
+from deepracer_exp.sim.batch import cores
 
-from .base import Collector, by_worker, cars_per_process, states_of, steps_per_batch, worker_count
 from .sampling import SamplingPolicy
 from .watchdog import Watchdog
 from .worker import CarCollector, EnvFactory
@@ -38,8 +38,16 @@ _CHUNK_STEPS = 32  # control steps of each car between two counts of the episode
 _T = TypeVar("_T")
 
 
-class LocalCollector(Collector):
-    """Collects in this process, or in several of this machine."""
+class Collector:
+    """An endless source of batches; a context manager that leaves no process behind.
+
+    Each batch is a TensorDict of batch size [cars of all processes, T], keys as in `RaceEnv` plus the policy's.
+
+    Attributes:
+        ahead_s: Seconds for which the last batch had been driven when it was asked for, see `begin_next`.
+    """
+
+    ahead_s = 0.0
 
     def __init__(
         self,
@@ -55,8 +63,9 @@ class LocalCollector(Collector):
 
         `frames_per_batch` is in control steps over all cars, and is rounded up to whole steps of all cars.
         """
-        policy = SamplingPolicy(policy)
+        self._policy = SamplingPolicy(policy)
         self._workers = worker_count(config)
+        self._steps = steps_per_batch(config, frames_per_batch)
         self._hang_timeout_s = config.hang_timeout_s
         self._run_dir = run_dir
         self._batches = 0
@@ -68,16 +77,15 @@ class LocalCollector(Collector):
         cars = cars_per_process(config)
         factory = functools.partial(EnvFactory, setup=setup, n_cars=cars, run_dir=run_dir, rivals=rivals)
         options: dict[str, Any] = {
-            "frames_per_batch": steps_per_batch(config, frames_per_batch) * config.cars,
+            "frames_per_batch": self._steps * config.cars,
             "total_frames": -1,
             "use_buffers": True,
             "trust_policy": True,
+            "auto_register_policy_transforms": False,
         }
         if self._workers == 0:
             env = factory(worker=0, threads=config.threads)
-            self._collector: Any = CarCollector(
-                env, policy, track_traj_ids=False, auto_register_policy_transforms=False, **options
-            )
+            self._collector: Any = CarCollector(env, self._policy, track_traj_ids=False, **options)
         else:
             heartbeat = run_dir / HEARTBEAT
             self._advice = f"; see {run_dir / LOG}"
@@ -86,15 +94,17 @@ class LocalCollector(Collector):
                 factory(worker=worker, threads=config.threads or 1, heartbeat=heartbeat)
                 for worker in range(self._workers)
             ]
-            self._collector = self._start(envs, policy, options)
+            self._collector = self._start(envs, options)
             self._watchdog.workers_started(self._collector.procs)
-            _watch_deliveries(self._collector.queue_out, self._watchdog)
         self._source = iter(self._collector)
         if states:
             with contextlib.ExitStack() as undo:
                 undo.callback(self.close)
                 self._restore_cars(states)
                 undo.pop_all()
+
+    def __enter__(self) -> Self:
+        return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if error is not None and self._watchdog is not None:
@@ -103,32 +113,66 @@ class LocalCollector(Collector):
             self._end_all()
         self.close()
 
+    def collect(self, algorithm: AlgorithmConfig) -> tuple[TensorDictBase, float]:
+        """Return the batch of one update, as large as the algorithm says, and the seconds it took to collect.
+
+        Raises:
+            RunFailed: a worker is lost.
+        """
+        chunks: list[TensorDictBase] = []
+        frames = episodes = 0
+        spent_s = 0.0
+        while True:
+            began = time.monotonic()
+            chunk = self.next_batch()
+            spent_s += time.monotonic() - began + self.ahead_s
+            frames += chunk.numel()
+            episodes += int(chunk["next", "done"].sum())
+            wanted = algorithm.episodes_per_iteration
+            enough = frames >= (algorithm.frames_per_iteration or 0) if wanted is None else episodes >= wanted
+            if not enough:
+                chunks.append(chunk.clone())
+                continue
+            whole = torch.cat([*chunks, chunk], dim=1) if chunks else chunk
+            return whole, spent_s
+
     def begin_next(self) -> None:
-        """Let the workers begin the next batch; cars of this process wait until it is asked for."""
+        """Let the workers begin the next batch with the policy published last, while the caller does other things.
+
+        Until it is asked for, only `state_dict`, which is that before this batch, and `close` may be called. Cars of
+        this process wait until it is asked for.
+        """
         if self._watchdog is not None:
             self._states = self._worker_states()
             self._begun_at_s = time.monotonic()
             self._next = _in_background(self._receive)
 
     def publish_policy(self) -> None:
-        """Pass the policy's weights to the workers."""
+        """Drive the next batches with the policy's present weights; raises as `next_batch`."""
         if self._watchdog is None:
             self._collector.update_policy_weights_()
             return
-        self._ask(self._publish, lambda: f"collector worker {self._receiver} took no new weights")
+        weights = weights_of(self._policy)
+        self._ask(
+            lambda: self._collector.map_fn("put_weights", [(weights,)] * self._workers),
+            "took no new weights",
+        )
 
     def publish_rivals(self, weights: Sequence[Weights]) -> None:
-        """Pass the rivals' weights to the workers."""
+        """Let policies with these weights drive the rivals from the next batch on; raises as `next_batch`."""
         if self._watchdog is None:
             self._collector.env.put_rivals(weights)
             return
         self._ask(
             lambda: self._collector.map_fn("env.put_rivals", [(weights,)] * self._workers),
-            lambda: "a collector worker took no new rivals",
+            "took no new rivals",
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state of the cars after the last batch."""
+        """Return everything that the next batch depends on except the policy: arrays and plain values.
+
+        It is the state at the end of the last batch; call it before the next. Raises as `next_batch`.
+        """
         if not self._batches:
             return dict(self._begun_from)
         if self._watchdog is None:
@@ -147,27 +191,26 @@ class LocalCollector(Collector):
             self._collector.shutdown()
             # TorchRL changes this process's number of threads, with which the last digits of sums change.
             torch.set_num_threads(threads)
-        if self._workers:
-            self._close_weights()
 
-    def _start(self, envs: list[EnvFactory], policy: torch.nn.Module, options: dict[str, Any]) -> Any:
+    def _start(self, envs: list[EnvFactory], options: dict[str, Any]) -> Any:
         others = len(multiprocessing.active_children())
-        # The scheme that TorchRL would use itself; ours can be closed even if no collector is returned.
-        self._weights = SharedMemWeightSyncScheme()
-        options = options | {
-            "weight_sync_schemes": {"policy": self._weights},
-            "collector_class": CarCollector,
-        }
         with contextlib.ExitStack() as undo:
             undo.callback(self._give_up_starting)
             try:
                 collector = MultiSyncCollector(
-                    envs, policy, num_threads=torch.get_num_threads(), cat_results="stack", **options
+                    envs,
+                    # A copy for each worker: TorchRL's ways to pass on weights keep queues that outlive a lost worker.
+                    policy_factory=functools.partial(copy.deepcopy, self._policy),
+                    weight_sync_schemes={},
+                    num_threads=torch.get_num_threads(),
+                    cat_results="stack",
+                    collector_class=CarCollector,
+                    **options,
                 )
             except (RuntimeError, ValueError, OSError) as error:
                 verdicts = self._watchdog.verdict.items() if self._watchdog is not None else ()
                 hung = next((f"worker {worker} {verdict}" for worker, verdict in verdicts), None)
-                reason = hung or str(error).split(". ")[0].splitlines()[0]
+                reason = hung or str(error).partition("\n")[0]
                 if not hung and isinstance(error, BrokenPipeError):
                     reason = f"worker {len(multiprocessing.active_children()) - others} died before it began"
                 raise RunFailed(f"collector workers did not start: {reason}") from error
@@ -180,18 +223,6 @@ class LocalCollector(Collector):
         for process in multiprocessing.active_children():
             process.kill()
             process.join()
-        self._close_weights()
-
-    def _close_weights(self) -> None:
-        """Close the queues through which workers receive new weights.
-
-        TorchRL does it when its collector is garbage-collected. After a failure that is when the interpreter exits,
-        which would then hang: on a queue that is never emptied, or on a thread that can no longer start.
-        """
-        for name in ("_weight_init_queues", "_instruction_queues", "_ack_queues"):
-            for queue in getattr(self._weights, name).values():
-                queue.cancel_join_thread()
-        self._weights.shutdown()
 
     def _restore_cars(self, states: Sequence[Any]) -> None:
         """Restore each worker's cars from its state."""
@@ -204,17 +235,19 @@ class LocalCollector(Collector):
             self._collector.map_fn("env.put_state", [(state,) for state in states])
             self._collector.map_fn("reset")
 
-        self._ask(put, lambda: "a collector worker did not restore its cars")
+        self._ask(put, "did not restore its cars")
 
     def _worker_states(self) -> list[Any]:
         """Return the state of each worker's cars after its last batch."""
         return self._ask(
-            lambda: self._collector.map_fn("env.take_state"),
-            lambda: "a collector worker did not report the state of its cars",
+            lambda: self._collector.map_fn("env.take_state"), "did not report the state of its cars"
         )
 
-    def _ask(self, question: Callable[[], _T], silence: Callable[[], str]) -> _T:
-        """Return the workers' answer; TorchRL alone would wait for it forever, even if the worker is dead."""
+    def _ask(self, question: Callable[[], _T], silence: str) -> _T:
+        """Return the workers' answer, or raise what `silence` says of the one that does not give it in time.
+
+        TorchRL alone would wait for it forever.
+        """
         assert self._watchdog is not None
         answer = _in_background(question)
 
@@ -225,25 +258,26 @@ class LocalCollector(Collector):
         if answer.done():
             try:
                 return answer.result()
-            except (RuntimeError, OSError, EOFError):  # what TorchRL and a broken pipe raise
+            except (RuntimeError, ValueError, OSError, EOFError):  # what TorchRL and a broken pipe raise
                 loss = self._loss(_DEATH_S)
                 if loss is None:
                     raise
         else:
             loss = self._loss_now()
+        # Answers are read in the order of the workers: those behind the silent one have theirs in the pipe.
+        worker = max((n for n, pipe in enumerate(self._collector.pipes) if not pipe.poll()), default=0)
         self._end_all()
         raise loss or RunFailed(
-            f"{silence()} for {silent} and was ended; the limit: collector.hang_timeout_s="
-            f"{self._hang_timeout_s:g}{self._advice}"
+            f"collector worker {worker} {silence} for {silent} and was ended; the limit: "
+            f"collector.hang_timeout_s={self._hang_timeout_s:g}{self._advice}"
         )
 
-    def _publish(self) -> None:
-        for worker in range(self._workers):
-            self._receiver = worker
-            self._collector.update_policy_weights_(worker_ids=worker)
-
     def next_batch(self) -> TensorDictBase:
-        """Return the next batch."""
+        """Return the next batch; it is valid until the one after it.
+
+        Raises:
+            RunFailed: a worker is lost.
+        """
         self._batches += 1
         if self._watchdog is None:
             return next(self._source)
@@ -258,7 +292,7 @@ class LocalCollector(Collector):
     def _receive(self) -> TensorDictBase:
         """Let the workers drive a batch and return it."""
         assert self._watchdog is not None
-        self._watchdog.expect()
+        self._watchdog.expect(self._steps)
         try:
             batch: TensorDictBase = next(self._source)
         except (RuntimeError, ValueError, OSError, EOFError) as error:  # what TorchRL and a broken pipe raise
@@ -317,20 +351,6 @@ def _in_background(question: Callable[[], _T]) -> Future[_T]:
     return answer
 
 
-def _watch_deliveries(queue: Any, watchdog: Watchdog) -> None:
-    """Report to the watchdog each worker's part that leaves the queue of TorchRL's synchronous collector."""
-    get = queue.get
-
-    def get_and_note(*args: Any, **options: Any) -> Any:
-        message = get(*args, **options)
-        # The worker's number; the first time, its buffer and its number.
-        part, _ = message
-        watchdog.delivered(part if isinstance(part, int) else part[1])
-        return message
-
-    queue.get = get_and_note
-
-
 def open_collector(
     config: CollectorConfig,
     algorithm: AlgorithmConfig,
@@ -357,10 +377,47 @@ def open_collector(
         RunFailed: a worker did not start.
     """
     frames = frames_per_batch(config, algorithm)
-    return LocalCollector(config, setup, policy, frames, run_dir, state, rivals)
+    return Collector(config, setup, policy, frames, run_dir, state, rivals)
 
 
 def frames_per_batch(config: CollectorConfig, algorithm: AlgorithmConfig) -> int:
     """Return the control steps, over all cars, to ask of a collector at a time."""
     frames = algorithm.frames_per_iteration
     return config.cars * _CHUNK_STEPS if frames is None else frames
+
+
+def worker_count(config: CollectorConfig) -> int:
+    """Return the number of worker processes, 0 for collection in this process."""
+    if config.mode == "in_process":
+        return 0
+    return config.processes or max(n for n in config.accepted_processes if n <= cores())
+
+
+def steps_per_batch(config: CollectorConfig, frames: int) -> int:
+    """Return the steps of each car in a batch of so many frames over all cars, rounded up to whole steps of all."""
+    return -(-frames // config.cars)
+
+
+def cars_per_process(config: CollectorConfig) -> int:
+    """Return how many of the cars drive in each process."""
+    return config.cars // max(1, worker_count(config))
+
+
+def by_worker(states: Iterable[Any]) -> dict[str, Any]:
+    """Return the states of workers as a collector's `state_dict`, whose keys are names."""
+    return {f"worker-{worker}": state for worker, state in enumerate(states)}
+
+
+def states_of(state: Mapping[str, Any], workers: int) -> list[Any]:
+    """Return the workers' states in a collector's `state_dict`; an empty one has none.
+
+    Raises:
+        BadInput: it is that of other workers.
+    """
+    names = by_worker(range(workers))
+    if state and state.keys() != names.keys():
+        raise BadInput(
+            "the checkpoint does not fit",
+            f"it has the cars of {count(len(state), 'worker')}; accepted by this collector: {len(names)}",
+        )
+    return [state[name] for name in names if state]

@@ -1,16 +1,15 @@
 """Imported first by the fork server, from which workers are forked, and by nothing else.
 
-The server ends once all its clients are gone. On its own it would look only after it has imported what its workers
-need, which takes many seconds on a busy machine.
+Workers end with the server (`end_with_owner`), and the server with the process that started it.
 """
 
-import os
-from pathlib import Path
+import signal
 
-from deepracer_exp.lifeline import kill_when_closed
+from deepracer_exp.lifeline import die_with_parent
 
-# Its clients hold the other end; it is the only pipe that the server is given (multiprocessing.forkserver).
-(_clients,) = (
-    int(path.name) for path in Path("/proc/self/fd").iterdir() if int(path.name) > 2 and path.is_fifo()
-)
-kill_when_closed(_clients, os.getpid())
+from .forking import SIGNALS
+
+die_with_parent()
+for signum in SIGNALS:
+    signal.signal(signum, signal.SIG_IGN)
+signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)

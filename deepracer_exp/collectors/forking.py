@@ -4,26 +4,22 @@ import os
 import signal
 import sys
 
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+"""What is sent to the process group for the training process alone, which ends its workers."""
 _PROGRAM = "deepracer_exp.cli"
 """What every worker imports first: the program of the process that started it."""
 
 
 def start_workers_early(wanted: bool, *modules: str) -> None:
-    """Start the server that workers are forked from, which imports what they need while this process does its part.
+    """Start the server that workers are forked from, if wanted, which imports what they need in the meantime.
 
-    One that runs already stays, or is ended if no workers are wanted. `modules` are imported for workers of a sweep;
+    It must be called in the main thread, with whose end the server ends. `modules` are imported for workers of a sweep;
     without them, what workers of a collector need.
     """
-    # By the clock, a worker waits so long for its first weights before it dies. Who hangs, the watchdog judges.
-    os.environ.setdefault("WEIGHT_SYNC_TIMEOUT", "86400")
-    if not sys.platform.startswith("linux"):
+    if not wanted or not sys.platform.startswith("linux"):
         return
     import multiprocessing
     from multiprocessing import forkserver
-
-    if not wanted:
-        forkserver._forkserver._stop()  # type: ignore[attr-defined]
-        return
 
     multiprocessing.set_start_method("forkserver", force=True)
     package = "deepracer_exp.collectors"
@@ -34,12 +30,13 @@ def start_workers_early(wanted: bool, *modules: str) -> None:
     # Workers share the cores among themselves already; a linear-algebra thread pool in each would only compete.
     before = os.environ.get("OMP_NUM_THREADS")
     os.environ["OMP_NUM_THREADS"] = "1"
-    # Signals to the process group are for the training process alone. The server inherits what is ignored now.
-    handlers = {signum: signal.signal(signum, signal.SIG_IGN) for signum in (signal.SIGINT, signal.SIGTERM)}
-    forkserver.ensure_running()
-    for signum, handler in handlers.items():
-        signal.signal(signum, handler)
-    if before is None:
-        del os.environ["OMP_NUM_THREADS"]
-    else:
-        os.environ["OMP_NUM_THREADS"] = before
+    # The server inherits this until it ignores them; here they are acted on afterwards.
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    try:
+        forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+        if before is None:
+            del os.environ["OMP_NUM_THREADS"]
+        else:
+            os.environ["OMP_NUM_THREADS"] = before

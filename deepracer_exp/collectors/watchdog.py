@@ -6,7 +6,6 @@ import multiprocessing
 import threading
 import time
 from collections.abc import Sequence
-from multiprocessing import forkserver
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -36,16 +35,18 @@ class Watchdog:
     def __init__(self, heartbeat: Path, workers: int, timeout_s: float, advice: str = ""):
         """Create the counters' file, one int64 per worker, and start watching.
 
-        Every worker delivers one part of each batch, and may rest until the next is asked for. `advice` ends each
-        verdict: where to read more.
+        Every worker drives one part of each batch, and may rest until all have. `advice` ends each verdict: where to
+        read more.
         """
         self._file = heartbeat
+        # Another may still have mapped the file that is there: without its bytes it would end by SIGBUS.
+        heartbeat.unlink(missing_ok=True)
         np.full(workers, -1, np.int64).tofile(heartbeat)
         self._beats = np.memmap(heartbeat, np.int64, "r")
         self._timeout_s = timeout_s
         self._start_timeout_s = max(_START_TIMEOUT_S, timeout_s)
         self._advice = advice
-        self._delivered = np.zeros(workers, bool)
+        self._asked = 0
         self._processes: Sequence[BaseProcess] | None = None
         self._pids: list[int] = []
         self._waiting = threading.Event()
@@ -69,14 +70,10 @@ class Watchdog:
 
         threading.Thread(target=wait_for_a_death, name="first death", daemon=True).start()
 
-    def expect(self) -> None:
-        """Note that each worker has been asked for its part of a batch, and that we wait for it."""
-        self._delivered[:] = False
+    def expect(self, steps: int) -> None:
+        """Note that each worker has been asked for so many more steps, and that we wait for them."""
+        self._asked += steps
         self._waiting.set()
-
-    def delivered(self, worker: int) -> None:
-        """Note that a worker's part has arrived: its last step alone is no proof, it may hang right after that."""
-        self._delivered[worker] = True
 
     def rest(self) -> None:
         """Note that nothing is waited for."""
@@ -97,7 +94,9 @@ class Watchdog:
         silences, said_s = [Silence() for _ in seen], 0.0
         while not self._over.wait(LOOK_EVERY_S):
             beats = np.array(self._beats)
-            is_silent = (beats == seen) & ~self._delivered & self._waiting.is_set()
+            # The last step alone is no proof: once all have made it, one of them has hung right after that.
+            may_rest = (beats >= self._asked) & (beats < self._asked).any()
+            is_silent = (beats == seen) & ~may_rest & self._waiting.is_set()
             seen = beats
             # Workers that are being started share what is compiled, so that some wait for others.
             of_all = use_of_this() if is_silent.any() and self._processes is None else None
@@ -134,20 +133,19 @@ class Watchdog:
             # Repeated at every look, because another one may have been started since.
             for process in multiprocessing.active_children():
                 process.kill()
-            _end_fork_servers_children()
+            _end_grandchildren()
         elif not is_first:
             with contextlib.suppress(ValueError):  # a handle that TorchRL has closed
                 self._processes[worker].kill()
 
 
-def _end_fork_servers_children() -> None:
+def _end_grandchildren() -> None:
     """End the workers that the fork server has forked, those included that have not yet read their task.
 
     Until a worker has read it, `multiprocessing` does not list the worker, and the training process waits for it.
     """
-    server = forkserver._forkserver._forkserver_pid  # type: ignore[attr-defined]
-    if server is None:
-        return
-    with contextlib.suppress(psutil.NoSuchProcess):
-        for process in psutil.Process(server).children():
-            process.kill()
+    for child in psutil.Process().children():
+        with contextlib.suppress(psutil.NoSuchProcess):
+            for process in child.children():
+                if process.cmdline() == child.cmdline():  # forked: a program would have another command line
+                    process.kill()

@@ -1,6 +1,5 @@
 """The environment of a collector's process."""
 
-import os
 import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -39,6 +38,11 @@ class CarCollector(Collector):
         """Set it up as the library does."""
         super().__init__(*arguments, **options)
         self.storing_device = None
+        self._batch = self.fake_tensordict()
+
+    def put_weights(self, weights: Weights) -> None:
+        """Drive with these weights of the policy from the next step on."""
+        self.policy.load_state_dict({name: torch.from_numpy(values) for name, values in weights.items()})
 
     @torch.no_grad()
     def rollout(self) -> TensorDictBase:
@@ -47,7 +51,7 @@ class CarCollector(Collector):
         Each step is written where it belongs in the batch. The base class makes a TensorDict of each and stacks them in
         the end, which takes a seventh of the time.
         """
-        batch, env, policy = self._final_rollout, self.env, self._wrapped_policy
+        batch, env, policy = self._batch, self.env, self.policy
         names = [key for key in batch.keys(True, True) if key[0] != "collector"]
         columns = {key: batch.get(key).numpy() for key in names}
         with set_exploration_type(self.exploration_type):
@@ -101,7 +105,7 @@ class EnvFactory:
             write_crash_dump(self.run_dir, error, worker)
             sys.stderr.flush()
             # No traceback from here: the training process finds the dump, prints its line and sets the exit code.
-            os._exit(RunFailed.exit_code)
+            sys.exit(RunFailed.exit_code)
 
         return _StateKeepingEnv(race, self.rivals, beat, end)
 

@@ -1,6 +1,6 @@
 """What an iteration does where its steps, cars and minibatches do not divide."""
 
-from deepracer_exp.collectors.base import steps_per_batch
+from deepracer_exp.collectors.collector import steps_per_batch
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.learning import PPOConfig
 

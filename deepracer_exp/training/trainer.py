@@ -18,8 +18,7 @@ from tensordict import TensorDictBase
 
 from deepracer_exp.agents.algorithm import UpdateMetrics
 from deepracer_exp.agents.build import build_agent, build_networks
-from deepracer_exp.collectors.base import Collector
-from deepracer_exp.collectors.collector import open_collector
+from deepracer_exp.collectors.collector import Collector, open_collector
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.env.placement import placements_table

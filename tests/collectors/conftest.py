@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from deepracer_exp.agents.actor_critic import build_actor_critic
-from deepracer_exp.collectors.collector import LocalCollector
+from deepracer_exp.collectors.collector import Collector
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.env.setup import build_setup
@@ -35,15 +35,13 @@ class Driver:
         self._weights = copy.deepcopy(self.policy.state_dict())
         self._opened = []
 
-    def open(self, state=None) -> LocalCollector:
+    def open(self, state=None) -> Collector:
         self.policy.load_state_dict(self._weights)
-        opened = LocalCollector(
-            self._config, self._setup, self.policy, self._frames, self._folder, state=state
-        )
+        opened = Collector(self._config, self._setup, self.policy, self._frames, self._folder, state=state)
         self._opened.append(opened)
         return opened
 
-    def learn(self, collection: LocalCollector, turn: int) -> None:
+    def learn(self, collection: Collector, turn: int) -> None:
         """Change the weights as an update would, in a way that depends on the turn alone."""
         generator = torch.Generator().manual_seed(turn)
         with torch.no_grad():
@@ -52,7 +50,7 @@ class Driver:
                 parameter.copy_(self._weights[name] + 0.3 * noise)
         collection.publish_policy()
 
-    def collect(self, collection: LocalCollector, turns: range) -> list:
+    def collect(self, collection: Collector, turns: range) -> list:
         batches = []
         for turn in turns:
             if turn:

@@ -166,7 +166,7 @@ def test_a_state_of_another_number_of_processes_is_refused(driver_of, nothing_le
     ("signum", "words"),
     [
         (signal.SIGKILL, r"collector worker 1 .* died by signal SIGKILL"),
-        (signal.SIGSTOP, "a collector worker did not report the state of its cars for 0 s of CPU and "),
+        (signal.SIGSTOP, "collector worker 1 did not report the state of its cars for 0 s of CPU and "),
     ],
 )
 def test_a_worker_that_does_not_answer_when_asked_for_its_cars_is_a_failure(

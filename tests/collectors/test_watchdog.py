@@ -59,7 +59,7 @@ def test_a_worker_without_a_step_is_ended_and_the_other_lives(watch, beats, proc
     dog = watch()
     counters = beats()
     counters[:] = 1
-    dog.expect()
+    dog.expect(10)
     _keep_beating(counters, [1], dog)
     assert list(dog.verdict) == [0]
     assert "after 1 steps" in dog.verdict[0]
@@ -70,34 +70,36 @@ def test_a_worker_without_a_step_is_ended_and_the_other_lives(watch, beats, proc
     assert processes[1].is_alive()
 
 
-def test_a_worker_whose_part_has_arrived_may_rest(watch, beats):
+def test_a_worker_that_has_driven_its_part_may_rest(watch, beats):
     dog = watch()
-    beats()[:] = 10
-    dog.expect()
-    dog.delivered(0)
+    beats()[:] = 10, 9
+    dog.expect(10)
     wait_until(lambda: dog.verdict)
     assert list(dog.verdict) == [1]
 
 
-def test_a_worker_that_delivered_one_batch_must_step_for_the_next(watch, beats):
-    """A worker may hang after the last step of its part as well as within it."""
+def test_a_worker_that_has_driven_one_part_must_step_for_the_next(watch, beats):
     dog = watch()
     counters = beats()
     counters[:] = 10
-    dog.expect()
-    dog.delivered(0)
-    dog.expect()
+    dog.expect(10)
+    dog.expect(10)
     _keep_beating(counters, [1], dog)
     assert list(dog.verdict) == [0]
+
+
+def test_workers_that_hang_after_the_last_step_of_their_parts_are_ended(watch, beats):
+    dog = watch()
+    beats()[:] = 10
+    dog.expect(10)
+    wait_until(lambda: dog.verdict)
 
 
 def test_a_worker_that_is_waited_for_is_named_now_and_then(watch, beats, monkeypatch, caplog):
     monkeypatch.setattr(watchdog, "_SAY_EVERY_S", 0.2)
     dog = watch(600.0)
-    counters = beats()
-    counters[:] = 1
-    dog.expect()
-    dog.delivered(0)
+    beats()[:] = 10, 1
+    dog.expect(10)
     wait_until(lambda: len(caplog.records) > 2, "lines")
     assert {record.args[0] for record in caplog.records} == {1}
     assert "collector worker 1 has taken no step for " in caplog.text

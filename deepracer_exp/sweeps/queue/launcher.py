@@ -93,6 +93,8 @@ def run_worker(config: WorkerConfig, token: str, log: str) -> None:
         os.dup2(file.fileno(), sys.stderr.fileno())
     logging.basicConfig(format="%(asctime)s %(process)d %(message)s", level=logging.WARNING)
     end_with_owner()
+    # Cars with processes of their own have another server, which is to end with this process.
+    multiprocessing.set_forkserver_preload(["deepracer_exp.collectors.fork_server"])
     with Interruption() as interruption:
         import optuna
         import torch
