@@ -91,5 +91,5 @@ def test_private_names_of_libraries_are_used_in_the_listed_files_alone():
         (TOP.parent / "docs" / "architecture.md").read_text().partition("## Private names of libraries")[2]
     )
     listed = {match[1]: set(re.findall(r"`(_\w+)`", match[2])) for match in _ROW.finditer(table)}
-    found = {str(file.relative_to(TOP)): set(private_names(file)) for file in TOP.rglob("*.py")}
+    found = {str(file.relative_to(TOP.parent)): set(private_names(file)) for file in TOP.rglob("*.py")}
     assert listed == {name: names for name, names in found.items() if names}
