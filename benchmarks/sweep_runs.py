@@ -26,7 +26,7 @@ from optuna.trial import FrozenTrial, TrialState
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.sweep import SweepRequest
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.runs.files import TRACKING, read_config, read_object
+from deepracer_exp.runs.files import MLFLOW, TRACKING, read_config, read_object
 from deepracer_exp.sweeps.report.labels import ending_of
 from deepracer_exp.sweeps.search.objectives import intermediate_value, objective_values
 from deepracer_exp.sweeps.trial import Trial
@@ -34,7 +34,7 @@ from deepracer_exp.sweeps.trial import Trial
 from .command import command_line, read_metrics, read_summary
 from .fresh import stored_policy
 
-_LEFT_BEHIND = ("trace", TRACKING)
+_LEFT_BEHIND = ("trace", TRACKING, MLFLOW)
 """Not copied from a trial's run: most of its bytes, and its link to MLflow."""
 _NOTED, _SCORES = "sweep_started.json", "scores.json"
 _NOTE_S = 5.0

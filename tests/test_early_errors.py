@@ -191,7 +191,7 @@ def refused(tmp_path_factory, call_at):
     )
     write_run(recorded / "stopped", config, status="stopped early", reason="converged", env_steps=9)
     store = f"sqlite:///{folder / 'recorded' / 'mlflow.db'}"
-    tracked = TrackedRun("a", "a", 0, store=store, run_id="id", complete=True)
+    tracked = TrackedRun("a", "a", 0, store=store, end_ms=1, run_id="id", complete=True)
     (recorded / "stopped" / "tracking.json").write_text(json.dumps(asdict(tracked)))
     code = f"""
 import contextlib, io, json, sys

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deepracer_exp.errors import BadInput, count
-from deepracer_exp.runs.files import TRACKING, full_name, run_folders
+from deepracer_exp.runs.files import full_name, run_folders
 
 from .arguments import (
     STORES,
@@ -79,7 +79,7 @@ def _send(args: argparse.Namespace) -> int:
     store = resolve_store(stores.uri, stores.runs_dir)
     named = [stores.find(run).path for run in runs]
     for folder in named:
-        recorded = read_tracked_run(folder / TRACKING).store
+        recorded = read_tracked_run(folder).store
         # What a run names as its store may be a stranger's, who would be given this user's password.
         if stores.uri is None and not store.is_named(recorded):
             raise BadInput(f"{folder}: was recorded in {recorded}; give tracking.uri={recorded}")
@@ -128,22 +128,21 @@ class _Target:
         from deepracer_exp.runs.labels import write_labels
         from deepracer_exp.tracking.delivery import deliver_labels
         from deepracer_exp.tracking.store import has_store, resolve_store
-        from deepracer_exp.tracking.tracking_file import TrackingFile, read_tracked_run
+        from deepracer_exp.tracking.tracking_file import note_problem, read_tracked_run
 
         if self.folder is not None:
             write_labels(self.folder, labels)
         store = resolve_store(self.stores.uri, self.stores.runs_dir)
         if self.run_id is None or not has_store(self.stores.uri, self.stores.runs_dir):
             return
-        if self.folder is not None and not store.is_named(read_tracked_run(self.folder / TRACKING).store):
+        if self.folder is not None and not store.is_named(read_tracked_run(self.folder).store):
             return  # a store that was not asked for
         try:
             deliver_labels(self.run_id, labels, self.stores.uri, self.stores.runs_dir)
         except BadInput as error:
             if self.folder is None:
                 raise
-            recorded = read_tracked_run(self.folder / TRACKING)
-            TrackingFile(self.folder, recorded, store.shown).change(complete=False)
+            note_problem(self.folder, str(error))
             word = shlex.quote(own_word(self.folder)) + store_word(self.stores.runs_dir, self.stores.uri)
             print(f"warning: {error}\n  send it later: deepracer-exp runs send {word}", file=sys.stderr)
 

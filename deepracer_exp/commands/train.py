@@ -134,20 +134,22 @@ def _train(args: argparse.Namespace) -> int:
     print_start()
     start_workers_early(any(plan.experiment.collector.forks for plan in plans))
 
+    from deepracer_exp.tracking.projector import Projector
     from deepracer_exp.training.run import run_training, try_out
 
     if len(plans) > 1:
         for plan in plans:
             try_out(plan)
     outcomes = []
-    for plan in plans:
-        outcome = run_training(plan, plain_console(stderr=True))
-        outcomes.append(outcome)
-        if plan.experiment.debug and outcome.error is not None:
-            traceback.print_exception(outcome.error)
-        print_result(outcome, plan.experiment.tracking)
-        if outcome.status == "interrupted":
-            break
+    with Projector() as projector:
+        for plan in plans:
+            outcome = run_training(plan, plain_console(stderr=True), projector=projector)
+            outcomes.append(outcome)
+            if plan.experiment.debug and outcome.error is not None:
+                traceback.print_exception(outcome.error)
+            print_result(outcome, plan.experiment.tracking)
+            if outcome.status == "interrupted":
+                break
     if args.multirun:
         print_results(outcomes, plans[0].experiment.tracking)
     return max(outcome.exit_code for outcome in outcomes)

@@ -28,6 +28,11 @@ REPORT = "report.html"
 BEST_LAP = "best_lap.png"
 LEARNING = "learning.png"
 TRACKING = "tracking.json"
+"""What the training says to trackers."""
+MLFLOW = "mlflow.json"
+"""What was recorded in MLflow."""
+MACHINE_USE = "machine.jsonl"
+"""Use of cores and memory, a row an iteration."""
 LABELS = "labels.json"
 """Name, note and tags that people gave the run."""
 LINEAGE = "lineage.json"
@@ -158,11 +163,13 @@ def read_run_id(path: Path) -> str | None:
     """Return MLflow's id of the run of a folder, None for one that is not recorded.
 
     Raises:
-        BadInput: its tracking.json cannot be read or holds something else.
+        BadInput: the file that has it cannot be read or holds something else.
     """
-    run_id = read_object(path / TRACKING).get("run_id")
+    # Version 0.1.0 kept it in tracking.json.
+    file = path / MLFLOW if (path / MLFLOW).exists() else path / TRACKING
+    run_id = read_object(file).get("run_id")
     if not isinstance(run_id, str | None):
-        raise BadInput(path / TRACKING, f"run_id: {run_id!r} is not a string")
+        raise BadInput(file, f"run_id: {run_id!r} is not a string")
     return run_id
 
 

@@ -29,6 +29,7 @@ from .files import (
     CRASH_DUMPS,
     LEARNING,
     LOG,
+    MACHINE_USE,
     METRICS,
     OVERRIDES,
     PROVENANCE,
@@ -125,6 +126,15 @@ class RunFolder:
         with self._metrics.open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
 
+    def append_machine_use(self, use: Mapping[str, float]) -> None:
+        """Add one line to machine.jsonl.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        with (self.path / MACHINE_USE).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(use) + "\n")
+
     def metrics(self) -> list[dict[str, Any]]:
         """Return the lines of metrics.jsonl."""
         return read_metrics(self._metrics) if self._metrics.exists() else []
@@ -136,6 +146,10 @@ class RunFolder:
     def rewind(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Go back to the last of these rows of metrics.jsonl: what was written later goes."""
         self.write_metrics(rows)
+        if (self.path / MACHINE_USE).exists():
+            steps = {row["env_steps"] for row in rows}
+            uses = [use for use in read_metrics(self.path / MACHINE_USE) if use["env_steps"] in steps]
+            self.write(MACHINE_USE, "".join(json.dumps(use) + "\n" for use in uses))
         for name in (SUMMARY, REPORT, BEST_LAP, LEARNING):
             (self.path / name).unlink(missing_ok=True)
         from .trace import rewind_trace  # imports pyarrow, which `is_held` does without

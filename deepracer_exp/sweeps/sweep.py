@@ -28,7 +28,6 @@ from deepracer_exp.env.setup import build_setup
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, TrialGroup
 from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.rewards.reward import RewardFunction
-from deepracer_exp.tracking.mlflow_process import RemoteRun
 from deepracer_exp.tracking.store import Store, resolve_store
 from deepracer_exp.tracking.study_run import Progress, StudyRun
 from deepracer_exp.tracking.tracking_file import Status
@@ -117,7 +116,7 @@ def sweep(plan: SweepPlan, console: Console) -> tuple[Study, Path, int]:
         acting.remember()
         # Only runs above the seeds of a trial cannot do without it; the id of an earlier start may be of another store.
         waits = config.seeds > 1 or RUN_ID in study.user_attrs
-        study_run, study_run_id = begin_study_run(request, space, store, storage, runs_dir, waits=waits)
+        study_run, study_run_id = begin_study_run(request, space, store, runs_dir, waits=waits)
         worker_config = WorkerConfig(
             study=request.study,
             runs_dir=launcher.folder(runs_dir),
@@ -147,7 +146,6 @@ def begin_study_run(
     request: SweepRequest,
     space: SearchSpace,
     store: Store | None,
-    storage: RDBStorage,
     runs_dir: Path,
     *,
     waits: bool = True,
@@ -159,9 +157,10 @@ def begin_study_run(
     """
     if store is None:
         return None, None
-    config, database = request.entry.sweep, resolve_database(request.entry.sweep.storage, runs_dir)
-    lock = partial(database.creation_lock, storage.engine)
-    run = StudyRun(store, request.study, config.objectives, space.as_text(), request.base, RemoteRun, lock)
+    folder = runs_dir / request.study
+    folder.mkdir(parents=True, exist_ok=True)
+    objectives, lock = request.entry.sweep.objectives, folder / ".mlflow.lock"
+    run = StudyRun(store, request.study, objectives, space.as_text(), request.base, lock)
     return run, run.wait_for_id() if waits else None
 
 

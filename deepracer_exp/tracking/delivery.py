@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 from deepracer_exp.errors import BadInput, RunFailed
@@ -15,7 +16,7 @@ from .metadata import NAME, USER_NOTE, label_tags
 from .metrics import now_ms, points_at
 from .projection import MLflowProjection
 from .store import has_store, open_client, resolve_store
-from .tracking_file import Status, TrackingFile, read_tracked_run
+from .tracking_file import Status, read_recorded, read_tracked_run, write_tracked_run
 
 ENDS: dict[str, Status] = {FINISHED: "FINISHED", STOPPED_EARLY: "FINISHED", FAILED: "FAILED"}
 """MLflow's word for the `status` in a run's summary; any other is KILLED."""
@@ -32,27 +33,28 @@ def deliver(run_dir: Path, uri: str | None, runs_dir: Path) -> int:
         BadInput: a file is missing, the run has not ended, or MLflow refuses (the run was deleted there).
         RunFailed: the store does not answer; try again later.
     """
-    summary = read_object(run_dir / SUMMARY)
+    tracked, summary = read_tracked_run(run_dir), read_object(run_dir / SUMMARY)
     if not summary:
         raise BadInput(
             run_dir,
             "has no summary.json, so the run has not ended; only ended runs can be recorded afterwards",
         )
     store = resolve_store(uri, runs_dir)
-    file = TrackingFile(run_dir, read_tracked_run(run_dir / TRACKING), store.shown)
-    if file.run.status is None:  # killed before it noted its end
-        file.change(status=ENDS.get(summary["status"], "KILLED"), end_ms=now_ms())
-    projection = MLflowProjection(store, file)
+    if tracked.store != store.shown:
+        tracked = replace(tracked, store=store.shown, run_id=None, complete=False)
+    if tracked.status is None:  # killed before it noted its end
+        tracked = replace(tracked, status=ENDS.get(summary["status"], "KILLED"), end_ms=now_ms())
+    write_tracked_run(run_dir, tracked)
+    projection = MLflowProjection(store, run_dir)
     try:
-        refused = projection.update()
+        problem = projection.update()
     except StoreUnavailableError as error:
         raise RunFailed(
             f"{run_dir}: MLflow ({store.shown}) does not answer; the run folder keeps what is missing there:"
             f" {error}"
         ) from error
-    for what, reason in refused.items():
-        raise BadInput(run_dir, f"MLflow ({store.shown}) refused {what}: {reason}")
-    file.change(complete=True)
+    if problem is not None:
+        raise BadInput(run_dir, f"MLflow ({store.shown}) {problem}")
     return projection.written
 
 
@@ -97,8 +99,9 @@ def is_delivered(run_dir: Path, uri: str | None, runs_dir: Path) -> bool:
     Raises:
         BadInput: tracking.json is invalid, or `uri` can never work.
     """
-    run, store = read_tracked_run(run_dir / TRACKING), resolve_store(uri, runs_dir)
-    return run.complete and store.is_named(run.store) and has_store(uri, runs_dir)
+    run, store = read_tracked_run(run_dir), resolve_store(uri, runs_dir)
+    is_whole = read_recorded(run_dir).has_all_of(run)
+    return is_whole and store.is_named(run.store) and has_store(uri, runs_dir)
 
 
 def undelivered(folders: Iterable[Path]) -> dict[Path, str]:
@@ -110,8 +113,12 @@ def undelivered(folders: Iterable[Path]) -> dict[Path, str]:
         BadInput: a tracking.json is invalid.
     """
     ended = [folder for folder in folders if (folder / TRACKING).exists() and (folder / SUMMARY).exists()]
-    tracked = {folder: read_tracked_run(folder / TRACKING) for folder in ended}
-    return {folder: run.store for folder, run in tracked.items() if not run.complete}
+    tracked = {folder: read_tracked_run(folder) for folder in ended}
+    return {
+        folder: run.store
+        for folder, run in tracked.items()
+        if run.store and not read_recorded(folder).has_all_of(run)
+    }
 
 
 def deliver_labels(run_id: str, labels: Labels, uri: str | None, runs_dir: Path) -> None:
@@ -147,7 +154,7 @@ def marked_deleted(run_dir: Path, run_id: str, uri: str | None, runs_dir: Path) 
     Raises:
         BadInput: the run was recorded in another store, or this one does not answer.
     """
-    recorded = read_tracked_run(run_dir / TRACKING).store
+    recorded = read_tracked_run(run_dir).store
     if not resolve_store(uri, runs_dir).is_named(recorded):
         raise BadInput(
             run_dir, f"was recorded in {recorded}; give tracking.uri={recorded} to delete it there"

@@ -1,173 +1,161 @@
-"""The tracker of a run: by `tracking.kind`, here those that write through TorchRL's loggers, or a class of your own.
+"""Projections of a run folder to TensorBoard and Weights & Biases, through TorchRL's loggers.
 
 Metrics have the same names as in MLflow.
 """
 
-import importlib.util
-import logging
 import re
 import shutil
-import threading
-from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from typing_extensions import override
 
-from deepracer_exp.config.own_class import OwnClass, build_own
-from deepracer_exp.config.running import (
-    MLflowTracking,
-    TensorBoardTracking,
-    TrackingConfig,
-    TrackingOff,
-    WandbTracking,
-)
-from deepracer_exp.errors import BadInput
-from deepracer_exp.patience import ends, wait_patiently
+from deepracer_exp.config.running import WandbTracking
 from deepracer_exp.runs.files import TENSORBOARD, WANDB
 
 from .metrics import recordable_values
-from .mlflow_process import RemoteRun
-from .mlflow_tracker import MLflowTracker
-from .store import resolve_store
-from .tracker import FINISH_S, Tracker
-from .tracking_file import Status, TrackedRun
-
-_log = logging.getLogger(__name__)
+from .projection import Projection, files_to_keep
+from .tracking_file import TrackedRun
 
 
-class TensorBoardTracker(Tracker):
-    """Writes event files into the run folder; a resumed run writes them again from its metrics.jsonl."""
+class LoggerProjection(Projection):
+    """What a logger of TorchRL has of a run; each process that records the run opens one of its own."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self._logger: Any = None
+        self._rows_logged, self._last_logged = 0, dict[str, float]()
+        """Number of rows of metrics.jsonl that it has, and the values of the last of them."""
+        self._tags: dict[str, str] = {}
+        self._is_closed = False
 
     @override
-    def open(self, folder: Path, run: TrackedRun) -> None:
+    def _project(self, tracked: TrackedRun) -> Mapping[str, str]:
+        if self._is_closed:
+            return {}
+        if self._logger is None:
+            self._open(tracked)
+        for step, values in self._new_values(tracked):
+            self._log(values, step)
+        for key, value in tracked.tags.items():
+            if self._tags.get(key) != value:
+                self._tag(key, value)
+        self._tags = tracked.tags
+        if tracked.status is not None:
+            self._close(tracked)
+            self._is_closed = True
+        return {}
+
+    def _new_values(self, tracked: TrackedRun) -> Iterator[tuple[int, dict[str, float]]]:
+        """Yield the step and the values of each row that the logger lacks, or lacks something of."""
+        # The last row is read again: it gets an evaluation when the run ends.
+        for number, row in enumerate(self._rows(tracked), 1):
+            if number < self._rows_logged:
+                continue
+            values = recordable_values(row)
+            had = self._last_logged if number == self._rows_logged else {}
+            if new := {key: value for key, value in values.items() if key not in had}:
+                yield row["env_steps"], new
+            self._rows_logged, self._last_logged = number, values
+
+    def _open(self, tracked: TrackedRun) -> None:
+        raise NotImplementedError
+
+    def _log(self, values: Mapping[str, float], step: int) -> None:
+        raise NotImplementedError
+
+    def _tag(self, key: str, value: str) -> None:
+        raise NotImplementedError
+
+    def _close(self, tracked: TrackedRun) -> None:
+        raise NotImplementedError
+
+
+class TensorBoardProjection(LoggerProjection):
+    """Event files in the run folder; each process that records the run writes them again."""
+
+    kind = TENSORBOARD
+
+    @override
+    def _open(self, tracked: TrackedRun) -> None:
         from torchrl.record.loggers import get_logger
 
-        try:
-            shutil.rmtree(folder / TENSORBOARD, ignore_errors=True)
-            self._logger = get_logger(TENSORBOARD, logger_name=str(folder), experiment_name=TENSORBOARD)
-        except OSError as error:
-            raise BadInput(
-                "tracking=tensorboard", f"{folder / TENSORBOARD}: cannot be written: {error.strerror}"
-            ) from error
-        rows = "\n".join(f"| {key} | {value} |" for key, value in run.params.items())
+        shutil.rmtree(self.folder / TENSORBOARD, ignore_errors=True)
+        self._logger = get_logger(TENSORBOARD, logger_name=str(self.folder), experiment_name=TENSORBOARD)
+        rows = "\n".join(f"| {key} | {value} |" for key, value in tracked.params.items())
         self._logger.experiment.add_text("parameters", f"| key | value |\n|---|---|\n{rows}")
-        for key, value in run.tags.items():
-            self.set_tag(key, value)
 
     @override
-    def log(self, metrics: Mapping[str, float | None], step: int) -> None:
-        for key, value in recordable_values(metrics).items():
+    def _log(self, values: Mapping[str, float], step: int) -> None:
+        for key, value in values.items():
             self._logger.log_scalar(key, value, step=step)
+        self._logger.experiment.flush()
 
     @override
-    def set_tag(self, key: str, value: str) -> None:
+    def _tag(self, key: str, value: str) -> None:
         self._logger.experiment.add_text(key, value)
 
     @override
-    def finish(self, status: Status, deadline_s: float = FINISH_S) -> None:
+    def _close(self, tracked: TrackedRun) -> None:
         self._logger.experiment.close()
 
 
-class WandbTracker(Tracker):
-    """Records a run in Weights & Biases, which knows a resumed run by its id and a row by its step.
+class WandbProjection(LoggerProjection):
+    """A run in Weights & Biases, which knows a resumed run by its id and a row by its step."""
 
-    Rows wait until a checkpoint covers them, because recorded steps cannot be changed.
-    """
+    kind = WANDB
 
-    def __init__(self, config: WandbTracking) -> None:
+    def __init__(self, config: WandbTracking, folder: Path) -> None:
+        super().__init__(folder)
         self._config = config
-        self._held: deque[tuple[int, dict[str, float]]] = deque()
-        """Steps and values of the rows that wait."""
+        self._first_step = 0
 
     @override
-    def open(self, folder: Path, run: TrackedRun) -> None:
+    def _open(self, tracked: TrackedRun) -> None:
         import wandb
         from torchrl.record.loggers import get_logger
 
         config, run_id = (
             self._config,
-            re.sub(r"[^A-Za-z0-9_-]", "-", f"{run.experiment}-{folder.name}")[-128:],
+            re.sub(r"[^A-Za-z0-9_-]", "-", f"{tracked.experiment}-{self.folder.name}")[-128:],
         )
         offline = config.mode == "offline"
         if offline:  # the new one will have all rows
-            for earlier in (folder / WANDB).glob(f"offline-run-*-{run_id}"):
+            for earlier in (self.folder / WANDB).glob(f"offline-run-*-{run_id}"):
                 shutil.rmtree(earlier, ignore_errors=True)
-        try:
-            self._logger = get_logger(
-                WANDB,
-                logger_name=str(folder),
-                experiment_name=run.run_name,
-                wandb_kwargs={
-                    **{
-                        "id": run_id,
-                        "project": config.project,
-                        "entity": config.entity,
-                        "group": run.experiment,
-                    },
-                    **{"offline": offline, "log_env_packages": False},
-                    "settings": wandb.Settings(silent=True, console="off"),
+        self._logger = get_logger(
+            WANDB,
+            logger_name=str(self.folder),
+            experiment_name=tracked.run_name,
+            wandb_kwargs={
+                **{
+                    "id": run_id,
+                    "project": config.project,
+                    "entity": config.entity,
+                    "group": tracked.experiment,
                 },
-            )
-        except (wandb.Error, OSError) as error:
-            reason = " ".join(str(error).split())[:300]
-            raise BadInput(
-                "tracking=wandb",
-                reason,
-                "a machine that is logged in (`wandb login`), or tracking.mode=offline",
-            ) from error
+                **{"offline": offline, "log_env_packages": False},
+                "settings": wandb.Settings(silent=True, console="off"),
+            },
+        )
         self._first_step = self._logger.experiment.step
-        self._logger.log_hparams({**run.params, "tags": run.tags})
+        self._logger.log_hparams({**tracked.params, "tags": tracked.tags})
 
     @override
-    def log(self, metrics: Mapping[str, float | None], step: int) -> None:
+    def _log(self, values: Mapping[str, float], step: int) -> None:
+        # Recorded steps cannot be changed.
         if step >= self._first_step:
-            self._held.append((step, recordable_values(metrics)))
+            self._logger.log_metrics(values, step=step, override_global_step=True)
 
     @override
-    def safe_until(self, step: int) -> None:
-        while self._held and self._held[0][0] <= step:
-            covered, values = self._held.popleft()
-            self._logger.log_metrics(values, step=covered, override_global_step=True)
-
-    @override
-    def log_artifact(self, path: Path, folder: str | None = None) -> None:
-        if path.is_file():
-            self._logger.experiment.save(str(path), base_path=str(path.parent), policy="now")
-
-    @override
-    def set_tag(self, key: str, value: str) -> None:
+    def _tag(self, key: str, value: str) -> None:
         self._logger.experiment.summary[key] = value
 
     @override
-    def finish(self, status: Status, deadline_s: float = FINISH_S) -> None:
-        if status == "FINISHED":
-            self.safe_until(2**62)
-        # W&B waits without a limit for a server that does not answer.
-        code = 0 if status == "FINISHED" else 1
-        ending = threading.Thread(target=self._logger.experiment.finish, args=(code,), daemon=True)
-        ending.start()
-        wait_patiently(ends(ending), deadline_s)
-        if ending.is_alive():
-            self.failure = "W&B does not answer; `wandb sync` in the run folder uploads what is missing"
-            _log.warning(self.failure)
-
-
-def open_tracker(config: TrackingConfig, runs_dir: Path) -> Tracker:
-    """Return the tracker of a config.
-
-    Raises:
-        BadInput: `tracking.uri` can never work, a package is not installed, or a class cannot be used.
-    """
-    if isinstance(config, OwnClass):
-        return build_own(config, "tracking.target", Tracker)
-    if isinstance(config, TrackingOff):
-        return Tracker()
-    if isinstance(config, MLflowTracking):
-        return MLflowTracker(resolve_store(config.uri, runs_dir), RemoteRun)
-    if importlib.util.find_spec(config.kind) is None:
-        raise BadInput(
-            f"tracking={config.kind}: needs the package {config.kind}; install the project with its extra: "
-            f"pip install 'deepracer-exp[{config.kind}]'"
-        )
-    return TensorBoardTracker() if isinstance(config, TensorBoardTracking) else WandbTracker(config)
+    def _close(self, tracked: TrackedRun) -> None:
+        for file, _ in files_to_keep(self.folder):
+            if file.is_file():
+                self._logger.experiment.save(str(file), base_path=str(file.parent), policy="now")
+        # W&B waits without a limit for a server that does not answer; who waits for this process has one.
+        self._logger.experiment.finish(0 if tracked.status == "FINISHED" else 1)

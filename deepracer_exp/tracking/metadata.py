@@ -63,6 +63,9 @@ END_TAG = "end"
 STUDY = "sweep.study"
 """Tag of a study's runs and of its experiment: the study's name."""
 
+KIND = "sweep.kind"
+"""Tag of the runs above others: `study` or `trial`."""
+
 HOST = "host"
 """Tag of a run: the machine on which it began."""
 

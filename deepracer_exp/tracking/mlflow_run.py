@@ -1,21 +1,18 @@
 """One run in an MLflow store, by MlflowClient alone: no global tracking uri, no active run.
 
-Importing this module imports MLflow (two seconds with its database), so a training leaves it to another process
-(`mlflow_process`). Every call may be repeated: MLflow keys a metric point by run, key, step,
-timestamp and value, and parameters, tags, files and the end status are the same when written twice. So a
-request of a killed process that a slow server handles late does no harm either.
+Importing this module imports MLflow, which takes two seconds, so a training leaves it to another process (`project`).
+Every call may be repeated: MLflow keys a metric point by run, key, step, timestamp and value, and parameters, tags,
+files and the end status are the same when written twice. So a request of a killed process that a slow server handles
+late does no harm either.
 """
 
-import contextlib
-import os
-import shutil
-import sqlite3
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from mlflow import MlflowClient, __version__
+from filelock import FileLock
+from mlflow import MlflowClient
 from mlflow.entities import Metric, Param, RunTag, ViewType
 from mlflow.exceptions import MlflowException
 from mlflow.utils.validation import MAX_METRICS_PER_BATCH, MAX_PARAMS_TAGS_PER_BATCH, MAX_TAG_VAL_LENGTH
@@ -34,7 +31,7 @@ from .metadata import (
 )
 from .metrics import BEST, Point, best_metrics, points_at
 from .store import Store, client_of, silence_mlflow
-from .tracking_file import TrackedRun
+from .tracking_file import Group, TrackedRun
 
 silence_mlflow()
 
@@ -67,23 +64,22 @@ class MLflowRun:
                 _create_whole(file)
             return client_of(self._store)
 
-    def open(self, tracked: TrackedRun, *, is_first: bool = False) -> None:
+    def open(self, tracked: TrackedRun, run_id: str | None = None) -> None:
         """Create the run, or continue it if the store has it already, with or without an answer that said so.
 
-        `is_first`: there was no attempt to create it before.
+        `run_id`: the id of an earlier answer.
         """
-        self.run_id = tracked.run_id
         with store_errors():
-            if self.run_id is None:
+            if run_id is None:
                 experiment_id = self._experiment_id(tracked.experiment)
-                self.run_id = None if is_first else self._find(experiment_id, tracked)
-            if self.run_id is None:
+                run_id = self._find(experiment_id, tracked)
+            if run_id is None:
                 self.run_id = self._create(experiment_id, tracked)
                 return
-            self.read(self.run_id)
-            self._client.update_run(self.run_id, status="RUNNING")
+            self.read(run_id)
+            self._client.update_run(run_id, status="RUNNING")
             if END_TAG in self._tags and END_TAG not in tracked.tags:
-                self._client.delete_tag(self.run_id, END_TAG)
+                self._client.delete_tag(run_id, END_TAG)
                 del self._tags[END_TAG]
 
     def read(self, run_id: str) -> None:
@@ -95,14 +91,14 @@ class MLflowRun:
         self.run_id, self._is_new = run_id, False
         self._params, self._tags, self.metrics = run.data.params, run.data.tags, run.data.metrics
 
-    def open_only(self, tracked: TrackedRun, mark: Sequence[str]) -> None:
-        """Create a run, or continue the oldest one of its experiment that has the same values of the tags `mark`.
+    def open_only(self, tracked: TrackedRun, group: Group) -> None:
+        """Create a run, or continue the oldest one of its experiment that has the same values of the group's marks.
 
         Of two processes that create it at once, one sees the other's, continues that and deletes its own; MLflow has
-        no way to be sure of it, so that rarely there may be two.
+        no way to be sure of it, so that without the group's lock there may rarely be two.
         """
-        sought = {key: tracked.tags[key] for key in mark}
-        with store_errors():
+        sought = {key: tracked.tags[key] for key in group.marks}
+        with store_errors(), FileLock(group.lock) if group.lock else nullcontext():
             experiment_id = self._experiment_id(tracked.experiment)
             oldest = self._oldest(experiment_id, sought)
             if oldest is None:
@@ -111,7 +107,7 @@ class MLflowRun:
                 if oldest in (None, self.run_id):
                     return
                 self._client.delete_run(self.run_id)
-        self.open(replace(tracked, run_id=oldest))
+        self.open(tracked, oldest)
 
     def lacking(self, points: Sequence[Point]) -> list[Point]:
         """Return the points of which the store has none of the same metric and step."""
@@ -267,30 +263,10 @@ def _with(tags: Mapping[str, str]) -> str:
 def _create_whole(file: Path) -> None:
     """Create an SQLite store under another name and move it into place, so that a killed process leaves none.
 
-    MLflow creates its tables in dozens of steps, which take seconds, and cannot open an incomplete store. Beside the
-    compiled modules of this package there is a store without experiments from then on, of which the next is a copy.
+    MLflow creates its tables in dozens of steps, which take seconds, and cannot open an incomplete store.
     """
     aside = file.with_name(f".{file.name}.new")
     for left in file.parent.glob(f"{aside.name}*"):
         left.unlink()
-    empty = Path(__file__).with_name("__pycache__") / f"mlflow-{__version__}.db"
-    if empty.is_file():
-        shutil.copyfile(empty, aside)
-    else:
-        MlflowClient(tracking_uri=f"sqlite:///{aside}").search_experiments(max_results=1)
-        with contextlib.suppress(OSError):  # of an installation that cannot be written
-            _keep_empty(aside, empty)
+    MlflowClient(tracking_uri=f"sqlite:///{aside}").search_experiments(max_results=1)
     aside.replace(file)
-
-
-def _keep_empty(created: Path, empty: Path) -> None:
-    """Keep a copy of a new store without its experiment, which names the working folder."""
-    unfinished = empty.with_name(f".{empty.name}.{os.getpid()}")
-    empty.parent.mkdir(exist_ok=True)
-    shutil.copyfile(created, unfinished)
-    try:
-        with contextlib.closing(sqlite3.connect(unfinished)) as database, database:
-            database.execute("DELETE FROM experiments")
-        unfinished.replace(empty)
-    finally:
-        unfinished.unlink(missing_ok=True)

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from mlflow.store.artifact.artifact_repo import ArtifactRepository
 
 # MLflow reads this at each call and offers no parameter. Its own 7 retries would hold the queue for minutes after a
-# server is back: `StoreThread` retries instead.
+# server is back: `project.serve` retries instead.
 os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
 # It would print the address of each ended run, with its password.
 os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")

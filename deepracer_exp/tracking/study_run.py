@@ -1,32 +1,25 @@
-"""The MLflow run of a whole study, the parent of its trials' runs."""
+"""The MLflow run of a whole study, the parent of its trials' runs, and the run of a trial."""
 
 import hashlib
 import json
 import logging
 import re
 import shlex
-import threading
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from deepracer_exp.patience import wait_patiently
+from deepracer_exp.errors import BadInput
 
-from .calls import StoreRefusedError, StoreUnavailableError, ended_within
-from .metadata import END_TAG, NOTE, PARENT, STUDY, param_text, study_view, user_tags
-from .metrics import Point, now_ms, points_at, trial_metrics
-from .mlflow_process import Connect, RemoteRun, connect_here, released
+from .metadata import END_TAG, KIND, NOTE, PARENT, STUDY, param_text, study_view, user_tags
+from .metrics import now_ms, trial_metrics
+from .projector import ProjectedRun, Projector
 from .store import Store
-from .store_thread import StoreThread, refused_of
-from .tracking_file import Status, TrackedRun
+from .tracking_file import Group, Status, TrackedRun, read_recorded, read_tracked_run
 
-if TYPE_CHECKING:
-    from .mlflow_run import MLflowRun
-
-SEARCH, KIND, TRIAL = "sweep.search", "sweep.kind", "sweep.trial"
-"""Tags: a hash of what the study searches, `study` or `trial`, the number of the trial."""
+SEARCH, TRIAL = "sweep.search", "sweep.trial"
+"""Tags: a hash of what the study searches, the number of the trial. `sweep.kind` says which a run is."""
 _SOURCE = {"mlflow.source.name": "deepracer-exp sweep", "mlflow.source.type": "LOCAL"}
 _ENDS = {"FINISHED": "finished", "FAILED": "failed", "KILLED": "interrupted"}
 
@@ -69,10 +62,13 @@ class Progress:
 
 
 class StudyRun:
-    """Keeps a study's run in MLflow up to date, from a thread of its own.
+    """Keeps a study's run in MLflow up to date by a process of its own, which reads a folder that this one writes.
 
     Only the newest progress counts: while the store does not answer, older ones are dropped. A process that continues
     the study continues its run.
+
+    Attributes:
+        run_id: MLflow's id of the run, once it was waited for or asked for; None before.
     """
 
     def __init__(
@@ -82,129 +78,86 @@ class StudyRun:
         objectives: Sequence[str],
         space: Mapping[str, str],
         base: Sequence[str],
-        connect: Connect = connect_here,
-        creation_lock: Callable[[], AbstractContextManager[object]] = nullcontext,
+        lock: Path | None = None,
+        projector: Projector | None = None,
     ) -> None:
         """Start creating or finding the run of a search: expressions by key, and overrides of all trials.
 
-        `connect` says which process makes the calls. MLflow cannot create a run only if there is none: `creation_lock`
-        lets one process at a time look and create it.
+        MLflow cannot create a run only if there is none: the file `lock` lets one process at a time look and create it.
         """
         params = _params(space, base)
         search = hashlib.sha256(json.dumps([dict(space), list(base)], sort_keys=True).encode())
         tags = {STUDY: study, SEARCH: search.hexdigest()[:12], KIND: "study", **_SOURCE, **user_tags()}
-        self._store, self._connect, self._creation_lock = store, connect, creation_lock
-        self._tracked = TrackedRun(f"sweep {study}", study, now_ms(), params, tags)
         self._searched = [_param_name(key) for key in space]
-        self._objectives = objectives
-        self._run: MLflowRun | RemoteRun | None = None
-        self._progress: Progress | None = None
-        self._written: Progress | None = None
-        """Progress that MLflow has."""
-        self._report: Path | None = None
-        self._status: Status | None = None
-        self._is_shown, self._is_ended = False, False
+        self._group = Group(
+            marks=(STUDY, SEARCH, KIND),
+            lock=None if lock is None else str(lock),
+            experiment_tags={STUDY: study, **study_view(objectives, self._searched)},
+            study=study,
+        )
+        self._store = store
+        # Every process that continues a study has one of its own.
+        self._folder = tempfile.TemporaryDirectory(prefix="study-")
+        self._projector = Projector() if projector is None else projector
+        run = TrackedRun(
+            f"sweep {study}", study, now_ms(), params, tags, store=store.shown, group=self._group
+        )
+        self._run = ProjectedRun(Path(self._folder.name), run, store, self._projector)
+        self._run.begin(is_training=False)
+        self.run_id: str | None = None
         self._is_id_known = False
-        self._settled = threading.Event()
-        self._thread = StoreThread(self._update, store.shown, "the sweep continues")
-        self._thread.begin()
 
     def wait_for_id(self, deadline_s: float = 30.0) -> str | None:
         """Return the run's id in MLflow; None if the store refuses or does not answer in time."""
-        wait_patiently(self._settled.wait, deadline_s)
+        self.run_id = self.run_id or self._run.wait_for_answer(deadline_s).run_id
         return self.run_id
-
-    @property
-    def run_id(self) -> str | None:
-        """MLflow's id of the run, once it exists."""
-        return None if self._run is None else self._run.run_id
 
     def has_new_id(self) -> bool:
         """Return whether the run's id has become known since the last call."""
-        is_new = self.run_id is not None and not self._is_id_known
+        self.run_id = self.run_id or self._run.recorded.run_id
+        is_new = not self._is_id_known and self.run_id is not None
         self._is_id_known |= is_new
         return is_new
 
     def update(self, progress: Progress) -> None:
         """Record the progress of the study; returns at once."""
-        self._progress = progress
-
-    def log_report(self, file: Path) -> None:
-        """Store the study's page with the run at its end."""
-        self._report = file
-
-    def finish(self, status: Status, deadline_s: float = 30.0) -> bool:
-        """Write what is left for at most `deadline_s`, end the run and return whether it was ended."""
-        self._status = status
-        self._thread.finish(deadline_s)
-        released(self._run, is_done=self._thread.has_ended)
-        if not self._is_ended:
-            _log.warning("MLflow (%s): the study's run could not be marked %s", self._store.shown, status)
-        return self._is_ended
-
-    def _update(self) -> Mapping[str, str]:
-        """Write what MLflow lacks; return what it refuses, with the reasons."""
-        try:
-            run = self._opened()
-        except StoreRefusedError as error:
-            self._settled.set()
-            return {"the study's run": str(error)}
-        writes: dict[str, Callable[[], object]] = {
-            "the study's view": lambda: self._show_trials(run),
-            "the study's progress": lambda: self._write_progress(run),
-        }
-        if (status := self._status) is not None:
-            # Also trials that began before this run did.
-            writes["the trials"] = lambda: self._adopt(run)
-            if (report := self._report) is not None:
-                writes[f"file {report}"] = lambda: run.log_artifact(report, None)
-            writes["the end"] = lambda: self._end(run, status)
-        return refused_of(writes)
-
-    def _opened(self) -> "MLflowRun | RemoteRun":
-        if self._run is None:
-            run = self._connect(self._store)
-            with self._creation_lock():
-                run.open_only(self._tracked, (STUDY, SEARCH, KIND))
-            run.log(params=self._tracked.params)
-            self._run = run
-            self._settled.set()
-        return self._run
-
-    def _show_trials(self, run: "MLflowRun | RemoteRun") -> None:
-        if self._is_shown:
-            return
-        self._adopt(run)
-        study = self._tracked.tags[STUDY]
-        run.set_experiment_tags({STUDY: study, **study_view(self._objectives, self._searched)})
-        self._is_shown = True
-
-    def _adopt(self, run: "MLflowRun | RemoteRun") -> None:
-        run.adopt({STUDY: self._tracked.tags[STUDY]}, but=KIND)
-
-    def _write_progress(self, run: "MLflowRun | RemoteRun") -> None:
-        progress = self._progress
-        if progress is None or progress is self._written:
-            return
-        tags = {"sweep.progress": str(progress), NOTE: self._note(progress)}
+        tags = {**self._run.run.tags, "sweep.progress": str(progress), NOTE: self._note(progress)}
         if progress.best_trial is not None:
             tags["sweep.best_trial"] = str(progress.best_trial)
-        metrics = trial_metrics(
+            winner = f"trial {progress.best_trial}, {progress.best_shown}"
+            self._group = replace(self._group, winner=winner)
+        values = trial_metrics(
             {"lap_time": progress.lap_time_s, "completion": progress.completion, **progress.best_values}
         )
         counts = ("complete", "pruned", "failed", "env_steps")
-        metrics |= {f"study/{name}": getattr(progress, name) for name in counts}
-        points = points_at(metrics, progress.ended, now_ms())
-        # Also when no trial has ended since: in the end another one may be the best.
-        run.log(points if _is_news(run, points) else (), tags=tags)
-        if progress.best_trial is not None:
-            run.describe_study(f"trial {progress.best_trial}, {progress.best_shown}")
-        self._written = progress
+        values |= {f"study/{name}": getattr(progress, name) for name in counts}
+        known = {key: float(value) for key, value in values.items() if value is not None}
+        self._change(tags=tags, values=known, values_step=progress.ended, group=self._group)
 
-    def _end(self, run: "MLflowRun | RemoteRun", status: Status) -> None:
-        run.log(tags={END_TAG: _ENDS[status]})
-        run.end(status, now_ms())
-        self._is_ended = True
+    def log_report(self, file: Path) -> None:
+        """Store the study's page with the run at its end."""
+        self._group = replace(self._group, report=str(file.absolute()))
+
+    def finish(self, status: Status, deadline_s: float = 30.0) -> bool:
+        """Write what is left for at most `deadline_s`, end the run and return whether it was ended."""
+        tags = {**self._run.run.tags, END_TAG: _ENDS[status]}
+        self._change(tags=tags, group=self._group, status=status, end_ms=now_ms())
+        problem = self._run.wait_for_end(deadline_s)
+        self.run_id = self.run_id or self._run.recorded.run_id
+        self._projector.end()
+        self._folder.cleanup()
+        if problem is not None:
+            shown = self._store.shown
+            _log.warning("MLflow (%s): the study's run could not be marked %s: %s", shown, status, problem)
+        return problem is None
+
+    def _change(self, **changes: object) -> None:
+        try:
+            self._run.change(**changes)
+        except OSError as error:
+            _log.warning(
+                "MLflow (%s): the study's run is not recorded: %s", self._store.shown, error.strerror
+            )
 
     def _note(self, progress: Progress) -> str:
         """Return the description above the run, Markdown."""
@@ -216,7 +169,7 @@ class StudyRun:
             command, what, *words = map(shlex.quote, shlex.split(progress.best_line))
             line = " \\\n    ".join([f"{command} {what}", *words])
             lines.append(f"```\n{line}\n```")
-        params = self._tracked.params
+        params = self._run.run.params
         shared = params.keys() - set(self._searched)
         for title, keys in (("Searched", self._searched), ("All trials", shared)):
             if listed := [f"- `{key}`: `{value}`" for key, value in params.items() if key in keys]:
@@ -226,77 +179,62 @@ class StudyRun:
 
 
 def open_trial_run(
+    folder: Path,
     store: Store,
     study: str,
     trial: int,
     parent_run_id: str,
     base: Sequence[str],
+    projector: Projector,
     deadline_s: float = 30.0,
-    connect: Connect = connect_here,
 ) -> str | None:
     """Return the id in MLflow of the run that groups the seeds of a trial, created on the first call.
 
-    None if the store refuses or does not answer; the seeds are then nested under the study itself.
+    It is described in an empty folder. None if the store refuses or does not answer; the seeds are then nested under
+    the study itself.
     """
     tags = {STUDY: study, KIND: "trial", TRIAL: str(trial), PARENT: parent_run_id, **_SOURCE, **user_tags()}
-    tracked = TrackedRun(f"trial {trial}", study, now_ms(), _params({}, base), tags)
-
-    def open_run(run: "MLflowRun | RemoteRun") -> None:
-        run.open_only(tracked, (STUDY, KIND, TRIAL, PARENT))
-        run.log(params=tracked.params)
-
-    return _within(deadline_s, store, f"trial {trial} has no run there", open_run, connect)
+    group = Group(marks=(STUDY, KIND, TRIAL, PARENT))
+    tracked = TrackedRun(
+        f"trial {trial}", study, now_ms(), _params({}, base), tags, store=store.shown, group=group
+    )
+    run = ProjectedRun(folder, tracked, store, projector)
+    run.begin(is_training=False)
+    recorded = run.wait_for_answer(deadline_s)
+    if recorded.run_id is None:
+        projector.end()
+        reason = recorded.problem or f"no answer within {deadline_s:g} s"
+        _log.warning("MLflow (%s): trial %d has no run there: %s", store.shown, trial, reason)
+    return recorded.run_id
 
 
 def end_trial_run(
+    folder: Path,
     store: Store,
-    run_id: str,
     status: Status,
     reason: str,
     values: Mapping[str, float | None],
-    connect: Connect = connect_here,
+    projector: Projector,
+    deadline_s: float = 30.0,
 ) -> None:
-    """End the run of a trial, or change how it has ended, with its values by metric; errors are logged."""
+    """End the run of a trial, or change how it has ended, with its values by metric; errors are logged.
 
-    def end_run(run: "MLflowRun | RemoteRun") -> None:
-        run.read(run_id)
-        points = points_at(values, 0, now_ms())
-        run.log(points if _is_news(run, points) else (), tags={END_TAG: reason})
-        run.end(status, now_ms())
-
-    _within(30.0, store, f"run {run_id} was not ended there", end_run, connect)
-
-
-def _is_news(run: "MLflowRun | RemoteRun", points: Sequence[Point]) -> bool:
-    """Return whether one of the points has a value that is not the newest of its metric."""
-    return any(run.metrics.get(key) != value for key, value, *_ in points)
-
-
-def _within(
-    deadline_s: float,
-    store: Store,
-    failure: str,
-    call: "Callable[[MLflowRun | RemoteRun], None]",
-    connect: Connect,
-) -> str | None:
-    """Return the id of the run after `call`; None, with a warning, if it failed or did not finish in time.
-
-    MLflow itself retries for more than a minute to open a database.
+    `folder` describes it: that of `open_trial_run`, or the run folder of the only seed.
     """
-
-    def work() -> str | None:
-        run = connect(store)
-        try:
-            call(run)
-        finally:
-            released(run)
-        return run.run_id
-
     try:
-        return ended_within(deadline_s, work)
-    except (StoreRefusedError, StoreUnavailableError, TimeoutError) as error:
-        _log.warning("MLflow (%s): %s: %s", store.shown, failure, error)
-        return None
+        before = read_tracked_run(folder)
+        # Of a run that is not recorded, `runs send` records this as well.
+        waits = before.group is not None or read_recorded(folder).has_all_of(before)
+        run = ProjectedRun(folder, before, store, projector)
+        known = {key: value for key, value in values.items() if value is not None}
+        run.change(tags={**before.tags, END_TAG: reason}, values=known, status=status, end_ms=now_ms())
+        problem = run.wait_for_end(deadline_s) if waits else None
+    except (BadInput, OSError) as error:
+        problem = str(error)
+    if problem is not None:
+        _log.warning(
+            "MLflow (%s): the end of the trial in %s was not recorded: %s", store.shown, folder, problem
+        )
 
 
 def _params(space: Mapping[str, str], base: Sequence[str]) -> dict[str, str]:

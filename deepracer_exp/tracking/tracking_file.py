@@ -1,26 +1,45 @@
-"""`tracking.json`: the MLflow run of a run folder, and what the folder's other files do not say of it."""
+"""`tracking.json`, in which a training describes its run to trackers, and `mlflow.json`: what of it is recorded."""
 
 import json
 import logging
-import threading
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import TypeAdapter
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import atomic_write, read_json_as
-from deepracer_exp.runs.files import TRACKING
+from deepracer_exp.runs.files import MLFLOW, TRACKING
 
 Status = Literal["FINISHED", "FAILED", "KILLED"]
+
+REFUSED = "refused "
+"""Beginning of a problem that another attempt would not solve."""
 
 _log = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Group:
+    """What only a run has that stands above others: a study's above its trials', a trial's above its seeds'."""
+
+    marks: tuple[str, ...]
+    """Tags that identify it: a run of its experiment with the same values is continued, whoever has created it."""
+    lock: str | None = None
+    """File that one process at a time locks while it looks for the run and creates it."""
+    experiment_tags: dict[str, str] = field(default_factory=dict)
+    study: str | None = None
+    """The study whose trials are nested under it; None: those below say it themselves."""
+    winner: str | None = None
+    """The best of them in words, for the description of the experiment."""
+    report: str | None = None
+    """File that is stored with the run at its end."""
+
+
 @dataclass(frozen=True)
 class TrackedRun:
-    """Identity, parameters, tags and end of a run, whether or not MLflow has them yet."""
+    """Identity, parameters, tags and end of a run, whether or not a tracker has them yet: `tracking.json`."""
 
     run_name: str
     experiment: str
@@ -29,63 +48,102 @@ class TrackedRun:
     params: dict[str, str] = field(default_factory=dict)
     tags: dict[str, str] = field(default_factory=dict)
     store: str = ""
-    """Address of the MLflow that records the run, without password."""
-    run_id: str | None = None
-    """MLflow's id of the run; None until MLflow has created it."""
+    """Address of the MLflow that is to record the run, without password; empty for other trackers."""
     status: Status | None = None
     """MLflow's status of the ended run; None while it is running, or if it was killed."""
     end_ms: int | None = None
+    values: dict[str, float] = field(default_factory=dict)
+    """Metrics, by MLflow's names, that no other file has: of the trial that a run is, of a whole study."""
+    values_step: int = 0
+    """The step at which they are recorded."""
+    group: Group | None = None
+    """None for a training."""
+    run_id: str | None = None
+    """Read from folders of version 0.1.0, which had no `mlflow.json`; the same holds for `complete`."""
     complete: bool = False
-    """Whether the run has ended and the store has been given all of it."""
 
 
-class TrackingFile:
-    """`tracking.json` of a run folder, written atomically by the threads of the training and the tracker."""
+@dataclass(frozen=True)
+class Recorded:
+    """What was recorded of a run, and where: `mlflow.json`, and the like of other trackers."""
 
-    def __init__(self, folder: Path, run: TrackedRun, store: str) -> None:
-        """Write the file of a run, to record it in `store` (without password).
+    store: str = ""
+    """As in `TrackedRun`."""
+    run_id: str | None = None
+    """MLflow's id of the run; None until MLflow has created it."""
+    end_ms: int | None = None
+    """The end of the run that was recorded with all that had come before; None while there is none."""
+    problem: str | None = None
+    """What is not recorded, and why, on one line; None: there is nothing."""
 
-        For another store the id is dropped, because the run may have another one there, or none yet.
-        """
-        self.folder = folder
-        self._lock = threading.RLock()
-        self.run = run if run.store == store else replace(run, run_id=None, store=store, complete=False)
-        self.change()
+    @property
+    def is_refused(self) -> bool:
+        """Whether the tracker has answered and refuses something."""
+        return self.problem is not None and self.problem.startswith(REFUSED)
 
-    def change(self, **changes: Any) -> None:
-        """Set fields of the run."""
-        with self._lock:
-            self.run = replace(self.run, **changes)
-            try:
-                atomic_write(self.folder / TRACKING, json.dumps(asdict(self.run), indent=1) + "\n")
-            except OSError as error:
-                # Only needed after a kill; a full disk ends the training elsewhere.
-                _log.warning("%s: cannot be written: %s", self.folder / TRACKING, error.strerror)
-
-    def add_tag(self, key: str, value: str) -> None:
-        """Add a tag."""
-        with self._lock:
-            self.change(tags={**self.run.tags, key: value})
+    def has_all_of(self, run: TrackedRun) -> bool:
+        """Return whether the run has ended and all of it was recorded."""
+        is_last = run.end_ms is not None and self.end_ms == run.end_ms
+        return is_last and self.problem is None and self.store == run.store
 
 
-_TRACKED_RUN = TypeAdapter(TrackedRun)
+_TRACKED_RUN, _RECORDED = TypeAdapter(TrackedRun), TypeAdapter(Recorded)
 
 
-def read_tracked_run(path: Path) -> TrackedRun:
-    """Read a `tracking.json`.
+def read_tracked_run(folder: Path) -> TrackedRun:
+    """Read the `tracking.json` of a folder.
 
     Raises:
         BadInput: it is missing or invalid.
     """
-    run = read_json_as(path, _TRACKED_RUN, "a tracker")
+    run = read_json_as(folder / TRACKING, _TRACKED_RUN, "a training")
     if run is None:
-        raise BadInput(path, "is missing: the run was not recorded in MLflow, or the file was removed")
+        raise BadInput(
+            folder / TRACKING, "is missing: the run was not recorded in MLflow, or the file was removed"
+        )
     return run
 
 
-def begin_again(path: Path, run_dir: Path) -> None:
-    """Turn a copied `tracking.json` into that of the new run in `run_dir`."""
-    run = read_tracked_run(path)
+def write_tracked_run(folder: Path, run: TrackedRun) -> None:
+    """Write the `tracking.json` of a folder.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    values = {key: value for key, value in asdict(run).items() if value or key not in ("run_id", "complete")}
+    atomic_write(folder / TRACKING, json.dumps(values, indent=1) + "\n")
+
+
+def read_recorded(folder: Path, kind: str = "mlflow") -> Recorded:
+    """Read what a kind of tracker has recorded of the run of a folder; without entries if that is nothing.
+
+    Raises:
+        BadInput: a file is invalid.
+    """
+    recorded = read_json_as(folder / f"{kind}.json", _RECORDED, "a tracker")
+    if recorded is not None or kind != "mlflow":
+        return recorded or Recorded()
+    run = read_tracked_run(folder)
+    return Recorded(run.store, run.run_id, run.end_ms if run.complete else None)
+
+
+def write_recorded(folder: Path, recorded: Recorded, kind: str = "mlflow") -> None:
+    """Write what a kind of tracker has recorded."""
+    file = folder / f"{kind}.json"
+    try:
+        atomic_write(file, json.dumps(asdict(recorded), indent=1) + "\n")
+    except OSError as error:  # a full disk ends the training elsewhere
+        _log.warning("%s: cannot be written: %s", file, error.strerror)
+
+
+def note_problem(folder: Path, problem: str) -> None:
+    """Note that MLflow lacks something of an ended run."""
+    write_recorded(folder, replace(read_recorded(folder), problem=problem))
+
+
+def begin_again(folder: Path, run_dir: Path) -> None:
+    """Turn a copy of a run's folder into that of a run of its own, which will lie at `run_dir`."""
+    run = read_tracked_run(folder)
     tags = {**run.tags, "run_dir": str(run_dir.resolve())}
-    again = replace(run, run_id=None, tags=tags, complete=False)
-    atomic_write(path, json.dumps(asdict(again), indent=1) + "\n")
+    write_tracked_run(folder, replace(run, run_id=None, tags=tags, complete=False))
+    (folder / MLFLOW).unlink(missing_ok=True)

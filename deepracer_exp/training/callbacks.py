@@ -17,7 +17,7 @@ from deepracer_exp.runs.result import FINISHED, STOPPED_EARLY, Ending
 from deepracer_exp.stopping.rules import Decision, StoppingRule, build_rule
 from deepracer_exp.tracking.delivery import ENDS
 from deepracer_exp.tracking.metadata import END_TAG, joined
-from deepracer_exp.tracking.projection import files_to_keep
+from deepracer_exp.tracking.metrics import now_ms
 from deepracer_exp.tracking.tracker import FINISH_S, Tracker
 
 from .budget import Alerts
@@ -222,13 +222,13 @@ class ReportCallback(Callback):
 
 
 class TrackingCallback(Callback):
-    """Passes rows, tags and files to the tracker."""
+    """Passes rows and tags to the tracker, and writes machine.jsonl."""
 
     def __init__(self, tracker: Tracker, console: Console):
         self._tracker, self._console = tracker, console
 
     def on_replay(self, trainer: Trainer) -> None:
-        """Log the row again: the store may lack some, and takes none twice."""
+        """Log the row again: the tracker may lack some."""
         self._log(trainer)
 
     def on_fit_start(self, trainer: Trainer) -> None:
@@ -236,21 +236,18 @@ class TrackingCallback(Callback):
         machine_use(trainer.experiment.device)
 
     def on_iteration_end(self, trainer: Trainer) -> None:
-        """Log the row, and the use of the machine, which is not part of the record."""
-        self._tracker.safe_until(trainer.saved_steps)
+        """Log the row, and write the use of the machine, which is not part of the record, beside it."""
         self._log(trainer)
-        self._tracker.log_machine(machine_use(trainer.experiment.device), step=trainer.env_steps)
+        use = machine_use(trainer.experiment.device)
+        trainer.folder.append_machine_use({"env_steps": trainer.env_steps, "time_ms": now_ms(), **use})
 
     def on_train_end(self, trainer: Trainer) -> None:
-        """Log the last evaluation of a run that is over; of one that may be resumed, MLflow would keep it."""
+        """Log the last evaluation of a run that is over; of one that may be resumed, the tracker would keep it."""
         if trainer.evaluation is not None and not trainer.is_interrupted:
             self._tracker.log(eval_columns(trainer.evaluation), step=trainer.env_steps)
 
     def on_run_end(self, trainer: Trainer, result: TrainResult) -> None:
-        """Log files and end the run in the store; the result says what was not recorded."""
-        self._tracker.safe_until(trainer.saved_steps)
-        for file, folder in files_to_keep(trainer.folder.path):
-            self._tracker.log_artifact(file, folder)
+        """Let the tracker end the run; the result says what was not recorded."""
         self._tracker.set_tag(END_TAG, str(result.ending))
         if self._tracker.outage is not None:
             line = f"{self._tracker.outage}; waiting for at most {FINISH_S:g} s"

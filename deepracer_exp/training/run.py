@@ -48,9 +48,10 @@ from deepracer_exp.runs.result import FINISHED, INTERRUPTED, Ending
 from deepracer_exp.scratch import folder_aside
 from deepracer_exp.sim.batch import CarBatch
 from deepracer_exp.stopping.rules import UNDECIDED
-from deepracer_exp.tracking.loggers import open_tracker
 from deepracer_exp.tracking.metadata import joined, lineage_tags, run_params, run_tags
 from deepracer_exp.tracking.metrics import now_ms
+from deepracer_exp.tracking.projector import Projector
+from deepracer_exp.tracking.tracker import open_tracker
 from deepracer_exp.tracking.tracking_file import TrackedRun, begin_again, read_tracked_run
 
 from .budget import Budget
@@ -74,6 +75,7 @@ def run_training(
     run_name: str | None = None,
     tags: Mapping[str, str] = MappingProxyType({}),
     created: Callable[[Path], None] | None = None,
+    projector: Projector | None = None,
 ) -> TrainResult:
     """Train what was planned, a new run, a clone, or a run from its last checkpoint on; return how it ended.
 
@@ -84,6 +86,7 @@ def run_training(
         run_name: of the run in MLflow; None: from the reward function and the time.
         tags: of the run in MLflow, beside its own.
         created: called with the folder of a new run before it is recorded anywhere else.
+        projector: records several runs, one after the other; None: this run has one of its own.
 
     Raises:
         BadInput: before anything was started; no folder of a new run is left. A run cannot be resumed while it is
@@ -94,7 +97,7 @@ def run_training(
     # Signals are caught from here on, so that Ctrl-C during the start leaves a whole folder, too.
     with Interruption(_printing(console)) as interruption:
         if isinstance(plan, ResumePlan):
-            return _run(_reopen(plan, console, callbacks, run_name, tags), interruption)
+            return _run(_reopen(plan, console, callbacks, run_name, tags, projector), interruption)
         start = None
         if plan.parent is not None:
             start = read_parent(plan.parent, plan.experiment)
@@ -102,7 +105,7 @@ def run_training(
                 _printing(console)(note)
         setup = try_out(plan)
         memory = memory_needed(plan.experiment)
-        trainer = _begin(plan, setup, console, start, callbacks, run_name, tags, created)
+        trainer = _begin(plan, setup, console, start, callbacks, run_name, tags, created, projector)
         _print_lines([*rounded(plan.experiment), *memory], console)
         return _run(trainer, interruption)
 
@@ -136,7 +139,7 @@ def copy_run(run_dir: Path, attempt: int) -> Path:
     with folder_aside(target.parent, ".copy-") as aside:
         shutil.copytree(run_dir, aside, symlinks=True, ignore=left_out, dirs_exist_ok=True)
         if (aside / TRACKING).exists():
-            begin_again(aside / TRACKING, target)
+            begin_again(aside, target)
         aside.replace(target)
     return target
 
@@ -174,12 +177,13 @@ def _begin(
     run_name: str | None = None,
     tags: Mapping[str, str] = MappingProxyType({}),
     created: Callable[[Path], None] | None = None,
+    projector: Projector | None = None,
 ) -> Trainer:
     """Create the folder of a new run and record it."""
     experiment, composition, rival = plan.experiment, plan.composition, None
     if plan.rival is not None:
         rival = StoredRun(plan.rival.path, plan.rival.read_policy().path.name)
-    tracker = open_tracker(experiment.tracking, Path(experiment.runs_dir))
+    tracker = open_tracker(experiment.tracking, Path(experiment.runs_dir), projector)
     names = _names(composition, joined(track_names(setup)), setup.reward.name)
     every = standard_callbacks(experiment, setup, names, tracker, console, callbacks, rival)
     label = f"{names['track']}-{names['reward']}-seed{experiment.seed}"
@@ -250,6 +254,7 @@ def _reopen(
     callbacks: Sequence[Callback],
     run_name: str | None,
     tags: Mapping[str, str],
+    projector: Projector | None,
 ) -> Trainer:
     """Return a run to its last checkpoint."""
     run_dir, experiment, composition = plan.run_dir, plan.experiment, plan.composition
@@ -262,7 +267,7 @@ def _reopen(
     acting.refuse_reward(experiment.reward.file, run_dir.name, run_dir / REWARD)
     _try(experiment, setup)
     _forget_damaged_best(run_dir, state)
-    tracker = open_tracker(experiment.tracking, Path(experiment.runs_dir))
+    tracker = open_tracker(experiment.tracking, Path(experiment.runs_dir), projector)
     rival = kept_rival(experiment, run_dir)
     every = standard_callbacks(experiment, setup, names, tracker, console, callbacks, rival)
     folder = RunFolder(run_dir)
@@ -277,7 +282,7 @@ def _reopen(
             )
         trainer.load(checkpoint, state)
         if (folder.path / TRACKING).exists():
-            recorded = read_tracked_run(folder.path / TRACKING)
+            recorded = read_tracked_run(folder.path)
         else:  # killed before it was recorded, or trained with tracking=off
             commit = plan.provenance.get("git_commit")
             recorded = _described(trainer, composition, names, commit, run_name, tags)

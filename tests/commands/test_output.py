@@ -104,7 +104,8 @@ def test_what_mlflow_lacks_of_a_sweep_is_counted_with_the_command_that_sends_it(
         run.mkdir(parents=True)
         (run / "config.yaml").write_text("name: study\n")
         (run / "summary.json").write_text('{"status": "finished", "reason": "budget"}')
-        tracked = {"run_id": None, "run_name": "x", "experiment": "study", "start_ms": 0, "store": shown}
+        tracked = {"run_id": None, "run_name": "x", "experiment": "study", "start_ms": 0, "end_ms": 1}
+        tracked |= {"store": shown}
         (run / "tracking.json").write_text(json.dumps(tracked | {"complete": complete}))
     print_unsent(Path("runs/study"))
     warning, command = capsys.readouterr().err.strip().splitlines()

@@ -10,6 +10,7 @@ import pytest
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.runs import clean
 from deepracer_exp.runs.checkpoint_files import pin
+from deepracer_exp.tracking.delivery import undelivered
 from deepracer_exp.tracking.store import resolve_store
 from tests.tracking.conftest import Season, client, empty_database, free_port, season, server
 
@@ -23,8 +24,9 @@ def recorded(season: Season, client, tmp_path: Path) -> Path:
     (run / "provenance.json").write_text(json.dumps({"machine": {"user": "anna", "host": "box"}}))
     run_id = season.recorded(run, client)
     store = resolve_store(None, season.runs_dir).shown
-    tracked = {"run_id": run_id, "run_name": "1", "experiment": "season", "start_ms": 0, "store": store}
-    (run / "tracking.json").write_text(json.dumps(tracked | {"complete": True}))
+    tracked = {"run_name": "1", "experiment": "season", "start_ms": 0, "store": store, "end_ms": 1}
+    (run / "tracking.json").write_text(json.dumps(tracked))
+    (run / "mlflow.json").write_text(json.dumps({"store": store, "run_id": run_id, "end_ms": 1}))
     return run
 
 
@@ -35,7 +37,7 @@ def listed(call, *arguments: str) -> list[dict]:
 
 
 def test_a_name_a_note_and_tags_are_in_the_folder_and_in_mlflow_and_find_the_run(recorded, client, call):
-    run_id = json.loads((recorded / "tracking.json").read_text())["run_id"]
+    run_id = json.loads((recorded / "mlflow.json").read_text())["run_id"]
     for words in (
         ("rename", recorded.name, "blue"),
         ("note", "blue", "tyres=new, 5 s faster"),
@@ -92,7 +94,7 @@ def test_a_run_is_deleted_here_and_in_mlflow_only_with_yes(recorded, client, cal
     assert refused.code == 2
     assert "--yes" in refused.complaint
     assert recorded.is_dir()
-    run_id = json.loads((recorded / "tracking.json").read_text())["run_id"]
+    run_id = json.loads((recorded / "mlflow.json").read_text())["run_id"]
     assert call("runs", "delete", recorded.name, "--yes").code == 0
     assert not recorded.exists()
     assert client.get_run(run_id).info.lifecycle_stage == "deleted"
@@ -106,7 +108,7 @@ def test_a_run_that_cannot_be_removed_stays_active_in_mlflow(recorded, client, c
         raise RunFailed("checkpoints: cannot be removed: Permission denied")
 
     monkeypatch.setattr(clean, "remove", removed)
-    run_id = json.loads((recorded / "tracking.json").read_text())["run_id"]
+    run_id = json.loads((recorded / "mlflow.json").read_text())["run_id"]
     ended = call("runs", "delete", recorded.name, "--yes")
     assert ended.code == (2 if why == "in use" else 3)
     assert recorded.is_dir()
@@ -145,12 +147,13 @@ def test_a_label_that_a_server_did_not_take_is_sent_later(recorded, call, client
     ended = call("runs", "tag", recorded.name, "car=red", f"tracking.uri={away}")
     assert ended.code == 0
     assert f"send it later: deepracer-exp runs send runs/season/{recorded.name}" in ended.stderr
-    assert json.loads((recorded / "tracking.json").read_text())["complete"] is False
+    assert away in json.loads((recorded / "mlflow.json").read_text())["problem"]
+    assert undelivered([recorded]) == {recorded: away}
     assert json.loads((recorded / "labels.json").read_text())["tags"] == {"car": "red"}
 
 
 def test_a_run_of_another_machine_is_labelled_by_its_id(recorded, client, call, tmp_path):
-    run_id = json.loads((recorded / "tracking.json").read_text())["run_id"]
+    run_id = json.loads((recorded / "mlflow.json").read_text())["run_id"]
     uri = resolve_store(None, recorded.parents[1]).uri
     recorded.rename(tmp_path / "gone")
     assert call("runs", "tag", run_id, "car=red", f"tracking.uri={uri}").code == 0

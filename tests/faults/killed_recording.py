@@ -15,12 +15,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from deepracer_exp.runs.files import read_metrics
-from deepracer_exp.tracking import store_thread
+from deepracer_exp.tracking import projection, projector
 from deepracer_exp.tracking.metrics import now_ms
 from deepracer_exp.tracking.mlflow_run import MLflowRun
-from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.store import resolve_store
+from deepracer_exp.tracking.tracker import ProjectedTracker
 from deepracer_exp.tracking.tracking_file import TrackedRun, read_tracked_run
+from tests.tracking.conftest import ProjectorHere
 
 ITERATIONS = 160
 CHECKPOINT_EVERY = 12
@@ -41,16 +42,29 @@ def save(checkpoints: Path, iteration: int) -> None:
     aside.replace(checkpoints / "last")
 
 
+class Counted(projection.MLflowProjection):
+    """Counts in this class what all of them have written."""
+
+    points = 0
+
+    def update(self) -> str | None:
+        try:
+            return super().update()
+        finally:
+            Counted.points = self.written
+
+
 def record(run_dir: Path, uri: str) -> None:
     metrics, checkpoints, identity = (
         run_dir / name for name in ("metrics.jsonl", "checkpoints", "tracking.json")
     )
-    store_thread.UPDATE_S = 0.02
-    tracker = MLflowTracker(resolve_store(uri, run_dir))
+    projector.UPDATE_S = 0.02
+    projection.MLflowProjection = Counted
+    tracker = ProjectedTracker(resolve_store(uri, run_dir), ProjectorHere())
     kept = int((checkpoints / "last").resolve().name) if (checkpoints / "last").exists() else 0
     rows = read_metrics(metrics)[:kept] if metrics.exists() else []
     if identity.exists():
-        tracker.open(run_dir, read_tracked_run(identity))
+        tracker.open(run_dir, read_tracked_run(run_dir))
     else:
         (run_dir / "config.yaml").write_text("checkpoints: {every: 1}\n")
         described = {"params": {"seed": "1"}, "tags": {"run_dir": str(run_dir)}}
@@ -65,7 +79,7 @@ def record(run_dir: Path, uri: str) -> None:
             tracker.set_tag("half", str(2 * iteration // ITERATIONS))
             save(checkpoints, iteration)
             # So that kills come while the tracker is recording, not later.
-            while tracker._projection.written < (2 + len(KEYS)) * (iteration - kept):
+            while Counted.points < (2 + len(KEYS)) * (iteration - kept):
                 time.sleep(0.001)
         time.sleep(0.01)
     tracker.finish("FINISHED", 200)

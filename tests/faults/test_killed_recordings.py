@@ -15,14 +15,14 @@ from deepracer_exp.tracking.metrics import metric_name
 def test_a_recording_killed_again_and_again_leaves_every_point_once(tmp_path):
     kills = 5
     uri = f"sqlite:///{tmp_path}/mlflow.db"
-    script = Path(__file__).parent / "killed_recording.py"
-    command = [sys.executable, script, str(tmp_path), uri, str(kills)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    command = [sys.executable, "-m", "tests.faults.killed_recording", str(tmp_path), uri, str(kills)]
+    root = Path(__file__).parents[2]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("killed") == kills
     client = MlflowClient(tracking_uri=uri)
     (run,) = client.search_runs([client.get_experiment_by_name("race").experiment_id])
-    assert run.info.run_id == json.loads((tmp_path / "tracking.json").read_text())["run_id"]
+    assert run.info.run_id == json.loads((tmp_path / "mlflow.json").read_text())["run_id"]
     assert run.info.status == "FINISHED"
     rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert [row["iteration"] for row in rows] == list(range(1, 161))

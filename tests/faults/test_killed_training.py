@@ -26,7 +26,7 @@ def folder_of(where, runs_dir):
 
 
 def points_of(where, runs_dir, folder) -> dict[str, list[tuple[int, float]]]:
-    run_id = json.loads((folder / "tracking.json").read_text())["run_id"]
+    run_id = json.loads((folder / "mlflow.json").read_text())["run_id"]
     client = MlflowClient(tracking_uri=f"sqlite:///{where / runs_dir / 'mlflow.db'}")
     keys = client.get_run(run_id).data.metrics
     assert client.get_run(run_id).info.status == "FINISHED"

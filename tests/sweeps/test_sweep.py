@@ -89,13 +89,12 @@ def test_the_parent_is_resolved_when_a_study_is_begun_and_stays_the_same(trained
 def test_drivers_that_begin_at_once_share_one_run_in_mlflow(tmp_path):
     request = compose_sweep(["study=spring", LR])
     space, store = SearchSpace.from_request(request), resolve_store(None, tmp_path)
-    storages = [open_storage(None, tmp_path) for _ in range(4)]
 
-    def begin(storage):
-        return begin_study_run(request, space, store, storage, tmp_path)
+    def begin(_):
+        return begin_study_run(request, space, store, tmp_path)
 
     with ThreadPoolExecutor(4) as drivers:
-        begun = list(drivers.map(begin, storages))
+        begun = list(drivers.map(begin, range(4)))
     assert all(run.finish("FINISHED", 60) for run, _ in begun)
     client = MlflowClient(tracking_uri=store.uri)
     (found,) = client.search_runs([client.get_experiment_by_name("spring").experiment_id])

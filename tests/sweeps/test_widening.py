@@ -15,6 +15,7 @@ from deepracer_exp.sweeps.queue.trial_run import TrialRun
 from deepracer_exp.sweeps.queue.worker import Worker
 from deepracer_exp.sweeps.queue.worker_config import WorkerConfig
 from deepracer_exp.sweeps.search.space import SearchSpace
+from deepracer_exp.tracking.projector import Projector
 from deepracer_exp.training.signals import Interruption
 from tests.conftest import refused
 
@@ -51,7 +52,7 @@ def started(url, storage, tmp_path):
             protocol=compose_evaluation(["evaluation=sweep"])[0].evaluation,
             space=space, parent=None, store=None, study_run_id=None, evaluations=None, cores=1,
         )  # fmt: skip
-        return study, Worker(config, storage, "host:1:a")
+        return study, Worker(config, storage, "host:1:a", Projector())
 
     return start
 

@@ -18,6 +18,7 @@ from deepracer_exp.sweeps.queue.worker import Worker
 from deepracer_exp.sweeps.queue.worker_config import WorkerConfig
 from deepracer_exp.sweeps.search.space import SearchSpace
 from deepracer_exp.sweeps.trial import Trial
+from deepracer_exp.tracking.projector import Projector
 from deepracer_exp.training import callbacks
 from deepracer_exp.training.signals import Interruption
 
@@ -47,7 +48,7 @@ def worker(tmp_path, *asked: str) -> tuple[Worker, RDBStorage]:
         evaluations=None,
         cores=1,
     )
-    return Worker(config, storage, "host:1:a"), storage
+    return Worker(config, storage, "host:1:a", Projector()), storage
 
 
 def untrained(self: TrialRun, overrides) -> Trial:

@@ -1,9 +1,11 @@
 import json
 import os
+import queue
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,16 +15,56 @@ import yaml
 from mlflow import MlflowClient
 
 from deepracer_exp.runs.checkpoint_files import write_hashes
-from deepracer_exp.tracking import store_thread
+from deepracer_exp.runs.files import read_run_id
+from deepracer_exp.tracking import project, projector
 from deepracer_exp.tracking.metrics import metric_name, now_ms
 from deepracer_exp.tracking.mlflow_run import MLflowRun
-from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.registry import Registered, promote
 from deepracer_exp.tracking.store import Store, resolve_store
-from deepracer_exp.tracking.tracker import Tracker
+from deepracer_exp.tracking.tracker import ProjectedTracker, Tracker
 from deepracer_exp.tracking.tracking_file import TrackedRun
 from tests import waiting
 from tests.ports import find_port
+
+
+class ProjectorHere(projector.Projector):
+    """Records in a thread of this process, which has imported MLflow, in place of a process."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._lines: project.Lines = queue.SimpleQueue()
+        self.thread: threading.Thread | None = None
+
+    @property
+    def is_lost(self) -> bool:
+        return self.thread is None or not self.thread.is_alive()
+
+    def send(self, line: dict) -> None:
+        if self.is_lost:
+            self._lines = queue.SimpleQueue()
+            self.thread = threading.Thread(target=project.serve, args=(self._lines,), daemon=True)
+            self.thread.start()
+        self._lines.put(json.loads(json.dumps(line)))
+
+    def end(self) -> None:
+        self._lines.put(None)
+        self.thread = None
+
+
+class TrackerHere(ProjectedTracker):
+    """A tracker that records in a thread of this process."""
+
+    def __init__(self, store: Store) -> None:
+        self.projector = ProjectorHere()
+        super().__init__(store, self.projector)
+
+    def open(self, folder: Path, run: TrackedRun) -> None:
+        self._folder = folder
+        super().open(folder, run)
+
+    @property
+    def run_id(self) -> str | None:
+        return read_run_id(self._folder)
 
 
 @pytest.fixture(scope="session")
@@ -46,15 +88,9 @@ def mlflow(store: Store) -> MlflowClient:
 
 
 @pytest.fixture
-def identity(tmp_path: Path) -> Path:
-    """Where a tracker writes which MLflow run it records."""
-    return tmp_path / "tracking.json"
-
-
-@pytest.fixture
-def tracker(store: Store, tmp_path: Path) -> MLflowTracker:
+def tracker(store: Store, tmp_path: Path) -> TrackerHere:
     """The tracker of a run that has just begun."""
-    tracker = MLflowTracker(store)
+    tracker = TrackerHere(store)
     begin(tracker, tmp_path)
     return tracker
 
@@ -67,7 +103,7 @@ def begin(tracker: Tracker, folder: Path, name: str = "run", **described: dict[s
 @pytest.fixture(autouse=True)
 def prompt(monkeypatch) -> None:
     """Let every tracker bring its store up to date without pauses."""
-    monkeypatch.setattr(store_thread, "UPDATE_S", 0.05)
+    monkeypatch.setattr(projector, "UPDATE_S", 0.05)
 
 
 def write_rows(folder: Path, rows: list[dict], covered: int | None = None) -> None:
@@ -238,7 +274,7 @@ class Season:
         place = (self.runs_dir / "artifacts").as_uri()
         experiment = found.experiment_id if found else client.create_experiment("season", place)
         run_id = client.create_run(experiment, 0, {"run_dir": str(run.resolve())}).info.run_id
-        (run / "tracking.json").write_text(json.dumps({"run_id": run_id}))
+        (run / "mlflow.json").write_text(json.dumps({"run_id": run_id}))
         return run_id
 
     def promote(self, run: Path, name="best", model="season", uri: str | None = None) -> Registered:

@@ -8,12 +8,12 @@ from mlflow.environment_variables import MLFLOW_HTTP_REQUEST_TIMEOUT
 from mlflow.store.entities import PagedList
 
 from deepracer_exp.tracking import calls
-from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.registry import look_up
 from deepracer_exp.tracking.store import resolve_store
+from deepracer_exp.tracking.tracker import ProjectedTracker
 from tests.conftest import refused
 
-from .conftest import begin, write_rows
+from .conftest import TrackerHere, begin, write_rows
 from .odd_servers import odd_server
 
 ODD = {
@@ -50,12 +50,12 @@ def test_looking_up_an_alias_ends_in_one_sentence(odd, tmp_path):
     assert "API request" not in message
 
 
-def test_a_run_that_is_not_recorded_says_so_and_why(odd, tmp_path, wait_until, caplog):
+def test_a_run_that_is_not_recorded_says_so_and_why(odd, tmp_path, wait_until):
     uri, words = odd
-    tracker = MLflowTracker(resolve_store(uri, tmp_path))
+    tracker = TrackerHere(resolve_store(uri, tmp_path))
     begin(tracker, tmp_path, params={"seed": "1"})
     write_rows(tmp_path, [{"completion": 5.0}])
-    wait_until(lambda: caplog.records)  # of the first outage or refusal
+    wait_until(lambda: tracker.outage)
     tracker.finish("FINISHED", deadline_s=1.0)
     assert tracker.failure is not None
     assert tracker.failure.startswith(f"MLflow ({uri}): some of this run was not recorded: ")
@@ -80,7 +80,7 @@ def test_a_command_has_the_patience_of_mlflow_s_own_client(monkeypatch):
 def test_what_a_training_could_not_record_is_its_last_lines_and_is_sent_by_their_command(
     answer, tmp_path, call: Callable, train_here: Callable, server, monkeypatch
 ):
-    monkeypatch.setattr(MLflowTracker, "finish", partialmethod(MLflowTracker.finish, deadline_s=3.0))
+    monkeypatch.setattr(ProjectedTracker, "finish", partialmethod(ProjectedTracker.finish, deadline_s=10.0))
     with odd_server(answer) as uri:
         ended = train_here("tracking=mlflow", f"tracking.uri={uri}")
     assert ended.code == 0

@@ -5,14 +5,14 @@ import json
 import pytest
 
 from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.runs.files import read_run_id
 from deepracer_exp.tracking.calls import StoreRefusedError
 from deepracer_exp.tracking.delivery import deliver, deliver_evaluation, is_delivered
 from deepracer_exp.tracking.mlflow_run import MLflowRun
-from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.store import Store
 from deepracer_exp.tracking.tracking_file import TrackedRun, read_tracked_run
 
-from .conftest import begin, points, runs_of, write_rows
+from .conftest import TrackerHere, begin, points, runs_of, write_rows
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def run_dir(tmp_path, away):
     (folder / "checkpoints" / "000003").mkdir(parents=True)
     (folder / "checkpoints" / "000003" / "manifest.json").write_text("{}")
     (folder / "checkpoints" / "best").symlink_to("000003")
-    tracker = MLflowTracker(Store(away, None))
+    tracker = TrackerHere(Store(away, None))
     begin(tracker, folder, params={"seed": "1"}, tags={"track": "oval"})
     write_rows(folder, [{"wall_clock_s": n / 2, "completion": n / 3, "kl": None} for n in range(1, 4)])
     (folder / "summary.json").write_text(json.dumps({"status": "stopped early", "reason": "collapsed"}))
@@ -44,8 +44,8 @@ def test_a_run_that_the_store_never_saw_is_delivered_whole_and_once(run_dir, sto
     assert deliver(moved, store.uri, tmp_path) == 9
     assert is_delivered(moved, store.uri, tmp_path)
     (run,) = runs_of(mlflow)
-    tracked = read_tracked_run(moved / "tracking.json")
-    assert (run.info.run_id, run.info.run_name, run.info.status) == (tracked.run_id, "run", "FINISHED")
+    tracked = read_tracked_run(moved)
+    assert (run.info.run_id, run.info.run_name, run.info.status) == (read_run_id(moved), "run", "FINISHED")
     assert (run.info.start_time, run.info.end_time) == (tracked.start_ms, tracked.end_ms)
     assert run.data.params == {"seed": "1"}
     wanted = {"track": "oval", "stopping.rule": "collapsed", "end": "stopped early: collapsed"}
@@ -78,7 +78,7 @@ def test_a_store_that_is_still_away_is_named_and_costs_nothing(run_dir, away, tm
 
 def test_a_run_deleted_in_mlflow_is_refused(run_dir, store, mlflow, tmp_path):
     deliver(run_dir, store.uri, tmp_path)
-    run_id = read_tracked_run(run_dir / "tracking.json").run_id
+    run_id = read_run_id(run_dir)
     mlflow.delete_run(run_id)
     with pytest.raises(BadInput, match=f"{run_id} was deleted in MLflow"):
         deliver(run_dir, store.uri, tmp_path)

@@ -28,7 +28,7 @@ from tests.conftest import refused
 def away(season, client) -> Path:
     """The folder of a promoted run, which is gone; MLflow has its files."""
     run = season.champion(client)
-    run_id = json.loads((run / "tracking.json").read_text())["run_id"]
+    run_id = json.loads((run / "mlflow.json").read_text())["run_id"]
     for name in ("config.yaml", "overrides.yaml", "provenance.json", "summary.json"):
         client.log_artifact(run_id, str(run / name))
     shutil.rmtree(run)

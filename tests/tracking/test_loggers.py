@@ -2,31 +2,43 @@
 
 import json
 import struct
+from dataclasses import replace
 
 import pytest
 
-from deepracer_exp.config.running import TensorBoardTracking, WandbTracking
+from deepracer_exp.config.running import WandbTracking
 from deepracer_exp.runs.files import TENSORBOARD, WANDB
-from deepracer_exp.tracking.loggers import open_tracker
+from deepracer_exp.tracking.delivery import undelivered
+from deepracer_exp.tracking.loggers import TensorBoardProjection, WandbProjection
 from deepracer_exp.tracking.metrics import METRICS, metric_name
-from deepracer_exp.tracking.tracker import Tracker
-from deepracer_exp.tracking.tracking_file import TrackedRun
+from deepracer_exp.tracking.projection import Projection
+from deepracer_exp.tracking.tracking_file import TrackedRun, write_tracked_run
 from tests.conftest import IN_PROCESS
 
+from .conftest import write_rows
+
 ROWS = [
-    {"env_steps": 100 * k, "wall_clock_s": 2.0 * k, "mean_return": float(k), "eval_lap_time_s": None}
+    {"iteration": k, "env_steps": 100 * k, "wall_clock_s": 2.0 * k, "mean_return": float(k)}
+    | {"eval_lap_time_s": None}
     for k in (1, 2, 3)
 ]
 
 
-def record(tracker: Tracker, identity, rows, safe: int, status="FINISHED") -> None:
-    described = {"params": {"seed": "1"}, "tags": {"reward": "progress_delta"}}
-    tracker.open(identity.parent, TrackedRun("progress_delta s1", "tiny", 1, **described))
-    for row in rows:
-        tracker.log(row, step=row["env_steps"])
-    tracker.safe_until(safe)
-    tracker.set_tag("end", "finished: budget")
-    tracker.finish(status)
+def record(projection: Projection, rows, covered: int, status=None, laps=()) -> None:
+    """Project a folder with these rows, of which a checkpoint covers some; then their last laps, and the end."""
+    folder = projection.folder
+    (folder / "metrics.jsonl").unlink(missing_ok=True)
+    write_rows(folder, rows, covered)
+    run = TrackedRun("progress_delta s1", "tiny", 1, {"seed": "1"}, {"reward": "progress_delta"})
+    write_tracked_run(folder, run)
+    assert projection.update() is None
+    if status is not None:
+        (folder / "metrics.jsonl").unlink()
+        write_rows(folder, [*rows[:-1], {**rows[-1], **dict(laps)}], covered)
+        tags = {**run.tags, "end": "finished: budget"}
+        write_tracked_run(folder, replace(run, tags=tags, status=status, end_ms=2))
+        assert projection.update() is None
+        assert projection.is_done
 
 
 def scalars(folder):
@@ -39,25 +51,29 @@ def scalars(folder):
 
 @pytest.fixture
 def tensorboard(tmp_path):
-    """Open a tracker that writes for TensorBoard."""
+    """Open a projection to TensorBoard."""
     pytest.importorskip("tensorboard")
-    return lambda: open_tracker(TensorBoardTracking(kind="tensorboard"), tmp_path)
+    return lambda: TensorBoardProjection(tmp_path)
 
 
-def test_tensorboard_has_the_metrics_under_their_names_in_mlflow(tensorboard, identity, tmp_path):
-    record(tensorboard(), identity, ROWS, 0)
+def test_tensorboard_has_the_metrics_under_their_names_in_mlflow(tensorboard, tmp_path):
+    record(tensorboard(), ROWS, 2, "FINISHED", {"eval_lap_time_s": 9.5})
     found, events = scalars(tmp_path / TENSORBOARD)
     assert found == {
+        "train/iteration": [(100, 1.0), (200, 2.0), (300, 3.0)],
         "train/mean_return": [(100, 1.0), (200, 2.0), (300, 3.0)],
         "time/wall_clock_s": [(100, 2.0), (200, 4.0), (300, 6.0)],
+        "race/lap_time_s": [(300, 9.5)],
     }
     texts = {tag.removesuffix("/text_summary") for tag in events.Tags()["tensors"]}
     assert texts == {"parameters", "reward", "end"}
 
 
-def test_a_resumed_run_has_each_row_once_in_tensorboard(tensorboard, identity, tmp_path):
-    record(tensorboard(), identity, ROWS, 0, "KILLED")
-    record(tensorboard(), identity, [*ROWS[:2], {**ROWS[2], "mean_return": 7.0}], 300)
+def test_a_resumed_run_has_each_row_once_in_tensorboard(tensorboard, tmp_path):
+    record(tensorboard(), ROWS, 3)
+    found, _ = scalars(tmp_path / TENSORBOARD)
+    assert found["train/mean_return"] == [(100, 1.0), (200, 2.0), (300, 3.0)]
+    record(tensorboard(), [*ROWS[:2], {**ROWS[2], "mean_return": 7.0}], 3, "FINISHED")
     found, _ = scalars(tmp_path / TENSORBOARD)
     assert found["train/mean_return"] == [(100, 1.0), (200, 2.0), (300, 7.0)]
 
@@ -86,11 +102,11 @@ def read_wandb(folder) -> list[dict[str, float]]:
     return rows
 
 
-def test_wandb_has_only_rows_that_a_checkpoint_covers_and_each_once(identity, tmp_path, wait_until):
+def test_wandb_has_only_rows_that_a_checkpoint_covers_and_each_once(tmp_path, wait_until):
     pytest.importorskip("wandb")
     config = WandbTracking(kind="wandb", project="deepracer-exp", entity=None, mode="offline")
     for status, steps in (("KILLED", [100, 200]), ("FINISHED", [100, 200, 300])):
-        record(open_tracker(config, tmp_path), identity, ROWS, 200, status)
+        record(WandbProjection(config, tmp_path), ROWS, 2, status)
         # W&B's own process may still be writing.
         wait_until(lambda steps=steps: len(read_wandb(tmp_path / WANDB)) >= len(steps))
         rows = read_wandb(tmp_path / WANDB)
@@ -119,4 +135,4 @@ def test_a_training_writes_its_curves_for_tensorboard(call):
     steps = [row["env_steps"] for row in ended.metrics]
     assert [step for step, _ in found[metric_name("entropy")]] == steps
     assert found.keys() & {name for name, _ in METRICS.values()} == found.keys()
-    assert not (ended.folder / "tracking.json").exists()
+    assert not undelivered([ended.folder])  # which is of MLflow

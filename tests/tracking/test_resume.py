@@ -7,11 +7,10 @@ import pytest
 from mlflow import MlflowClient
 
 from deepracer_exp.errors import BadInput
-from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.store import resolve_store
 from deepracer_exp.tracking.tracking_file import read_tracked_run
 
-from .conftest import begin, cover, points, runs_of, write_rows
+from .conftest import TrackerHere, begin, cover, points, runs_of, write_rows
 
 
 def rows_until(iteration: int) -> list[dict[str, float]]:
@@ -25,35 +24,36 @@ def logged_until(iteration: int) -> list[tuple[int, float]]:
     return [(row["env_steps"], row["completion"]) for row in rows_until(iteration)]
 
 
-def reopened(store, identity) -> MLflowTracker:
+def reopened(store, folder) -> TrackerHere:
     """Return a tracker that continues a run."""
-    tracker = MLflowTracker(store)
-    tracker.open(identity.parent, read_tracked_run(identity))
+    tracker = TrackerHere(store)
+    tracker.open(folder, read_tracked_run(folder))
     return tracker
 
 
 @pytest.fixture
-def killed(store, mlflow, identity, wait_until):
+def killed(store, mlflow, tmp_path, wait_until):
     """Return the tracker of a run of ten iterations that was never finished."""
-    tracker = MLflowTracker(store)
+    tracker = TrackerHere(store)
     params, tags = {"seed": "1"}, {"track": "oval", "mlflow.note.content": "as it began"}
-    begin(tracker, identity.parent, params=params, tags=tags)
-    write_rows(identity.parent, rows_until(10))
+    begin(tracker, tmp_path, params=params, tags=tags)
+    write_rows(tmp_path, rows_until(10))
     wait_until(lambda: tracker.run_id and len(points(mlflow, tracker.run_id)) == 10)
-    tracker._thread.finish(0)
-    tracker._thread._thread.join()
+    thread = tracker.projector.thread
+    tracker.projector.end()
+    thread.join()
     return tracker
 
 
 @pytest.fixture
-def resumed(store, identity, killed):
+def resumed(store, tmp_path, killed):
     """Return a tracker that continues that run."""
-    return reopened(store, identity)
+    return reopened(store, tmp_path)
 
 
-def test_a_resumed_run_continues_the_same_mlflow_run(mlflow, identity, killed, resumed):
+def test_a_resumed_run_continues_the_same_mlflow_run(mlflow, tmp_path, killed, resumed):
     rows = rows_until(20)
-    write_rows(identity.parent, rows[10:])
+    write_rows(tmp_path, rows[10:])
     resumed.finish("FINISHED")
     assert resumed.failure is None
     (run,) = runs_of(mlflow)
@@ -62,7 +62,7 @@ def test_a_resumed_run_continues_the_same_mlflow_run(mlflow, identity, killed, r
     for key in ("completion", "iteration"):
         assert points(mlflow, run.info.run_id, key) == [(one["env_steps"], one[key]) for one in rows]
     history = mlflow.get_metric_history(run.info.run_id, "train/completion")
-    start_ms = read_tracked_run(identity).start_ms
+    start_ms = read_tracked_run(tmp_path).start_ms
     assert [point.timestamp - start_ms for point in history] == [125 * n for n in range(1, 21)]
     assert "env_steps" not in run.data.metrics
 
@@ -105,56 +105,55 @@ def test_the_last_row_is_completed_when_the_run_is_over(tracker, mlflow, tmp_pat
     assert len(points(mlflow, tracker.run_id, "kl")) == 3
 
 
-def test_a_run_whose_id_was_never_heard_is_found_again(store, mlflow, identity, killed):
-    identity.write_text(json.dumps({**json.loads(identity.read_text()), "run_id": None}))
-    tracker = reopened(store, identity)
+def test_a_run_whose_id_was_never_heard_is_found_again(store, mlflow, tmp_path, killed):
+    (tmp_path / "mlflow.json").unlink()
+    tracker = reopened(store, tmp_path)
     tracker.finish("FINISHED")
     assert tracker.failure is None
     assert [run.info.run_id for run in runs_of(mlflow)] == [killed.run_id]
-    assert read_tracked_run(identity).run_id == killed.run_id
+    assert tracker.run_id == killed.run_id
 
 
-def test_a_run_that_was_never_created_begins_when_it_began(store, mlflow, identity, free_port):
-    away = MLflowTracker(type(store)(f"http://127.0.0.1:{free_port}", None))
-    begin(away, identity.parent, params={"seed": "1"}, tags={"track": "oval"})
-    write_rows(identity.parent, rows_until(1))
+def test_a_run_that_was_never_created_begins_when_it_began(store, mlflow, tmp_path, free_port):
+    away = TrackerHere(type(store)(f"http://127.0.0.1:{free_port}", None))
+    begin(away, tmp_path, params={"seed": "1"}, tags={"track": "oval"})
+    write_rows(tmp_path, rows_until(1))
     away.finish("KILLED", deadline_s=0)
-    tracked = read_tracked_run(identity)
-    tracker = reopened(store, identity)
-    write_rows(identity.parent, rows_until(2)[1:])
+    assert away.run_id is None
+    tracked = read_tracked_run(tmp_path)
+    tracker = reopened(store, tmp_path)
+    write_rows(tmp_path, rows_until(2)[1:])
     tracker.finish("FINISHED")
     assert tracker.failure is None
     (run,) = runs_of(mlflow)
-    assert (tracked.run_id, run.info.start_time, run.info.run_name) == (None, tracked.start_ms, "run")
+    assert (run.info.start_time, run.info.run_name) == (tracked.start_ms, "run")
     assert (run.data.params, run.data.tags["track"]) == ({"seed": "1"}, "oval")
     assert points(mlflow, run.info.run_id) == logged_until(2)
 
 
-def test_a_run_resumed_with_another_store_is_complete_there(
-    store, mlflow, identity, killed, empty_database, tmp_path
-):
+def test_a_run_resumed_with_another_store_is_complete_there(store, mlflow, tmp_path, killed, empty_database):
     (tmp_path / "other").mkdir()
     shutil.copy(empty_database, tmp_path / "other" / "mlflow.db")
     other = resolve_store(None, tmp_path / "other")
-    tracker = reopened(other, identity)
-    write_rows(identity.parent, rows_until(12)[10:])
+    tracker = reopened(other, tmp_path)
+    write_rows(tmp_path, rows_until(12)[10:])
     tracker.finish("FINISHED")
     assert tracker.failure is None
     there = MlflowClient(tracking_uri=other.uri)
     assert [run.info.run_id for run in runs_of(there)] == [tracker.run_id]
     assert points(there, tracker.run_id) == logged_until(12)
-    tracker = reopened(store, identity)
+    tracker = reopened(store, tmp_path)
     tracker.finish("FINISHED")
     assert tracker.failure is None
     assert [run.info.run_id for run in runs_of(mlflow)] == [killed.run_id]
 
 
-def test_a_resumed_run_is_shown_as_running(store, mlflow, identity, killed, wait_until):
+def test_a_resumed_run_is_shown_as_running(store, mlflow, tmp_path, killed, wait_until):
     killed.set_tag("end", "interrupted: by Ctrl-C")
     mlflow.set_tag(killed.run_id, "end", "interrupted: by Ctrl-C")
     mlflow.set_terminated(killed.run_id, "KILLED")
     mlflow.set_tag(killed.run_id, "mlflow.note.content", "edited in the UI")
-    tracker = reopened(store, identity)
+    tracker = reopened(store, tmp_path)
     wait_until(lambda: mlflow.get_run(killed.run_id).info.status == "RUNNING")
     tracker.set_tag("went", "on")
     wait_until(lambda: "went" in mlflow.get_run(killed.run_id).data.tags)
@@ -167,11 +166,11 @@ def test_a_resumed_run_is_shown_as_running(store, mlflow, identity, killed, wait
 
 
 def test_a_run_deleted_in_mlflow_is_not_recorded_and_says_so_in_one_line(
-    store, mlflow, identity, killed, caplog
+    store, mlflow, tmp_path, killed, caplog
 ):
     mlflow.delete_run(killed.run_id)
-    tracker = reopened(store, identity)
-    write_rows(identity.parent, rows_until(20)[10:])
+    tracker = reopened(store, tmp_path)
+    write_rows(tmp_path, rows_until(20)[10:])
     tracker.finish("FINISHED")
     assert tracker.failure is not None
     (record,) = caplog.records
@@ -179,10 +178,10 @@ def test_a_run_deleted_in_mlflow_is_not_recorded_and_says_so_in_one_line(
     assert points(mlflow, killed.run_id) == logged_until(10)
 
 
-def test_a_repeated_iteration_that_differs_is_not_doubled(mlflow, killed, identity, resumed):
+def test_a_repeated_iteration_that_differs_is_not_doubled(mlflow, killed, tmp_path, resumed):
     *same, last = rows_until(10)
-    (identity.parent / "metrics.jsonl").unlink()
-    write_rows(identity.parent, [*same, last | {"completion": 99.0}])
+    (tmp_path / "metrics.jsonl").unlink()
+    write_rows(tmp_path, [*same, last | {"completion": 99.0}])
     resumed.finish("FINISHED")
     assert resumed.failure is None
     assert points(mlflow, killed.run_id) == logged_until(10)
@@ -196,25 +195,25 @@ TRACKED = {"run_id": None, "run_name": "a", "experiment": "b", "start_ms": 2, "s
     [
         (None, "is missing"),
         ("{", "Invalid JSON"),
-        ("[]", "accepted: what a tracker writes there"),
+        ("[]", "accepted: what a training writes there"),
         ("{}", "run_name: Field required"),
         (json.dumps(TRACKED | {"run_id": 1}), "run_id: Input should be"),
         (json.dumps(TRACKED | {"start_ms": "x"}), "start_ms: Input should be"),
     ],
 )
-def test_a_file_that_no_tracker_wrote_is_refused(store, identity, text, says):
+def test_a_file_that_no_tracker_wrote_is_refused(store, tmp_path, text, says):
     if text is not None:
-        identity.write_text(text)
+        (tmp_path / "tracking.json").write_text(text)
     with pytest.raises(BadInput, match=says) as refused:
-        reopened(store, identity)
-    assert str(identity) in str(refused.value)
+        reopened(store, tmp_path)
+    assert str(tmp_path / "tracking.json") in str(refused.value)
 
 
 def test_the_result_of_a_run_heads_its_description_and_that_of_its_experiment(store, mlflow, tmp_path):
     def train(name: str, lap_s: float) -> str:
         folder = tmp_path / name
         folder.mkdir()
-        tracker = MLflowTracker(store)
+        tracker = TrackerHere(store)
         tags = {"mlflow.note.content": "as it began"}
         begin(tracker, folder, name, tags=tags)
         (folder / "best_lap.png").write_bytes(b"picture")

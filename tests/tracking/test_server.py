@@ -12,17 +12,16 @@ from pathlib import Path
 import pytest
 from mlflow import MlflowClient
 
-from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.store import resolve_store
 
-from .conftest import begin, points, runs_of, write_rows
+from .conftest import TrackerHere, begin, points, runs_of, write_rows
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize("away", ["killed", "hanging"])
 def test_a_server_that_is_away_blocks_nothing_and_gets_everything_once(server, tmp_path, wait_until, away):
-    tracker = MLflowTracker(resolve_store(server.uri, tmp_path))
+    tracker = TrackerHere(resolve_store(server.uri, tmp_path))
     begin(tracker, tmp_path, params={"seed": "1"}, tags={"track": "oval"})
     write_rows(tmp_path, [{"completion": float(number)} for number in range(20)])
     client = MlflowClient(tracking_uri=server.uri)
@@ -42,10 +41,8 @@ def test_a_server_that_is_away_blocks_nothing_and_gets_everything_once(server, t
 
 
 def test_recordings_and_servers_that_are_killed_by_turns_leave_every_point_once(server, tmp_path):
-    script = Path(__file__).parents[1] / "faults" / "killed_recording.py"
-    recording = subprocess.Popen(
-        [sys.executable, script, str(tmp_path), server.uri, "5"], start_new_session=True
-    )
+    command = [sys.executable, "-m", "tests.faults.killed_recording", str(tmp_path), server.uri, "5"]
+    recording = subprocess.Popen(command, cwd=Path(__file__).parents[2], start_new_session=True)
     try:
         for _ in range(2):
             time.sleep(4)

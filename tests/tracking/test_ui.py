@@ -14,19 +14,18 @@ from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.tracking import ui
 from deepracer_exp.tracking.metadata import VIEW, run_params, run_tags
 from deepracer_exp.tracking.metrics import METRICS
-from deepracer_exp.tracking.mlflow_tracker import MLflowTracker
 from deepracer_exp.tracking.registry import look_up
 from deepracer_exp.tracking.store import existing_store
 from deepracer_exp.tracking.ui import running_ui, runs_page, serve_ui
 from tests.waiting import PATIENCE_S
 
-from .conftest import begin
+from .conftest import TrackerHere, begin
 
 NAMES = {"track": "reinvent_base", "reward": "progress_per_step", "network": "mlp_small"}
 
 
 def record(store, runs_dir: Path, seed: int) -> str:
-    tracker, folder = MLflowTracker(store), runs_dir / str(seed)
+    tracker, folder = TrackerHere(store), runs_dir / str(seed)
     folder.mkdir()
     params = run_params({}, NAMES, {"seed": seed, "algorithm": {"lr": 3e-4}, "reward": {"constants": {}}}, [])
     tags = run_tags(NAMES, "0123abc", "feed" * 16, runs_dir / "race" / str(seed))

@@ -148,7 +148,7 @@ def test_in_mlflow_a_clone_stands_under_its_parent(call, tmp_path):
     parent = ended.folder
     child = child_of(parent, call("clone", parent.name, "budget.iterations=1"))
     client = MlflowClient(tracking_uri=f"sqlite:///{tmp_path / 'runs' / 'mlflow.db'}")
-    ids = [json.loads((folder / "tracking.json").read_text())["run_id"] for folder in (parent, child)]
+    ids = [json.loads((folder / "mlflow.json").read_text())["run_id"] for folder in (parent, child)]
     tags = client.get_run(ids[1]).data.tags
     assert tags["mlflow.parentRunId"] == ids[0]
     assert tags["lineage.parent"] == parent.name

@@ -278,7 +278,7 @@ def test_mlflow_does_not_name_a_rule_that_no_longer_ends_the_run(call, tmp_path)
     quick = ("experiment=tiny", "collector=in_process", "collector.threads=1", *OFTEN)
     ended = call("train", *quick, *SOON, "budget.env_steps=null", "budget.iterations=4")
     client = MlflowClient(tracking_uri=f"sqlite:///{tmp_path / 'runs' / 'mlflow.db'}")
-    run_id = json.loads((ended.folder / "tracking.json").read_text())["run_id"]
+    run_id = json.loads((ended.folder / "mlflow.json").read_text())["run_id"]
     assert client.get_run(run_id).data.tags["stopping.rule"] == "plateau"
     assert call("resume", ended.folder.name, "stopping=none").code == 0
     tags = client.get_run(run_id).data.tags

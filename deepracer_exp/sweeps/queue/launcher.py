@@ -12,6 +12,7 @@ from deepracer_exp.config.acting import take_over_named
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.lifeline import end_with_owner
 from deepracer_exp.sim.batch import cores
+from deepracer_exp.tracking.projector import Projector
 from deepracer_exp.training.signals import Interruption
 
 from .worker_config import WorkerConfig, owner_name
@@ -106,7 +107,8 @@ def run_worker(config: WorkerConfig, token: str, log: str) -> None:
         torch.set_num_threads(1)
         try:
             storage = open_storage(config.config.storage, config.runs_dir, config.config.patience_s)
-            Worker(config, storage, owner_name(os.getpid(), token)).work(interruption)
+            with Projector() as projector:
+                Worker(config, storage, owner_name(os.getpid(), token), projector).work(interruption)
         except (BadInput, RunFailed) as error:
             _log.error("%s", error)
             sys.exit(error.exit_code)

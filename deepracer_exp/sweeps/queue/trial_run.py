@@ -5,6 +5,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 import optuna
@@ -34,7 +35,7 @@ from deepracer_exp.sweeps.search.pruners import FirstOf, PruneDecision
 from deepracer_exp.sweeps.trial import Interrupted, SeedRun, Trial, runs_as_json
 from deepracer_exp.tracking.metadata import PARENT, STUDY
 from deepracer_exp.tracking.metrics import trial_metrics
-from deepracer_exp.tracking.mlflow_process import RemoteRun
+from deepracer_exp.tracking.projector import Projector
 from deepracer_exp.tracking.study_run import TRIAL, end_trial_run, open_trial_run
 from deepracer_exp.tracking.tracking_file import Status
 from deepracer_exp.training.budget import RunEnded
@@ -79,8 +80,9 @@ class TrialRun(Callback):
         study: optuna.Study,
         storage: BaseStorage,
         trial_id: int,
+        projector: Projector,
     ):
-        """Load what is known of the claim's trial, which has this id in Optuna."""
+        """Load what is known of the claim's trial, which has this id in Optuna; `projector` records its runs."""
         self._config, self._claims, self._lease = config, claims, lease
         self._study, self._storage, self._trial_id = study, storage, trial_id
         self._trial = optuna.trial.Trial(study, trial_id)
@@ -92,6 +94,7 @@ class TrialRun(Callback):
         """Index of the present run."""
         self._parent_run_id: str | None = None
         """MLflow's id of the run above those of the trial."""
+        self._projector = projector
 
     def make(self) -> Trial:
         """Make what is missing of the trial.
@@ -102,9 +105,10 @@ class TrialRun(Callback):
             RunFailed: the database has not answered for too long.
         """
         overrides = self._overrides()
-        self._parent_run_id = self._mlflow_parent(overrides)
-        ended = self._ended(overrides)
-        self._track(ended)
+        with TemporaryDirectory(prefix="trial-") as above:
+            self._parent_run_id = self._mlflow_parent(overrides, Path(above))
+            ended = self._ended(overrides)
+            self._track(ended, Path(above))
         return ended
 
     def failed(self, reason: str, trace: str) -> Trial:
@@ -241,7 +245,9 @@ class TrialRun(Callback):
         if self._seed:
             plan = self._planned([*lines, f"seed={experiment.seed + self._seed}"])
         title, tags = self._title_and_tags()
-        return run_training(plan, None, [self], run_name=title, tags=tags, created=self._begin)
+        return run_training(
+            plan, None, [self], run_name=title, tags=tags, created=self._begin, projector=self._projector
+        )
 
     def _resumed(self, run: SeedRun) -> TrainResult | None:
         """Resume a run that was begun; None if there is nothing to resume."""
@@ -256,7 +262,7 @@ class TrialRun(Callback):
         title, tags = self._title_and_tags()
         try:
             plan = plan_resume(run_dir, [])
-            return run_training(plan, None, [self], run_name=title, tags=tags)
+            return run_training(plan, None, [self], run_name=title, tags=tags, projector=self._projector)
         except RunEnded:
             summary = read_object(run_dir / SUMMARY)
             ending = Ending.stored(summary)
@@ -306,8 +312,11 @@ class TrialRun(Callback):
         tags = {STUDY: self._config.study, TRIAL: str(self._number)}
         return title, tags if self._parent_run_id is None else {**tags, PARENT: self._parent_run_id}
 
-    def _mlflow_parent(self, overrides: Sequence[str]) -> str | None:
-        """Return MLflow's id of the run above those of the trial: the study's, with several seeds one of the trial."""
+    def _mlflow_parent(self, overrides: Sequence[str], above: Path) -> str | None:
+        """Return MLflow's id of the run above those of the trial: the study's, with several seeds one of the trial.
+
+        The latter is described in the folder `above`.
+        """
         store, study_run_id = self._config.store, self._config.study_run_id
         if store is not None and self._config.config.seeds == 1:
             # The driver has started the workers before MLflow answered.
@@ -315,17 +324,19 @@ class TrialRun(Callback):
         if store is None or study_run_id is None:
             return study_run_id
         trial_run_id = open_trial_run(
-            store, self._config.study, self._number, study_run_id, overrides, connect=RemoteRun
+            above, store, self._config.study, self._number, study_run_id, overrides, self._projector
         )
         return trial_run_id or study_run_id
 
-    def _track(self, ended: Trial) -> None:
-        """Write the trial's result to MLflow, beside what its runs have logged."""
+    def _track(self, ended: Trial, above: Path) -> None:
+        """Let MLflow have the trial's result, beside what its runs have logged."""
         if self._config.store is None:
             return
-        run_id = self._parent_run_id if self._config.config.seeds > 1 else self._runs[0].mlflow_run_id
+        run = self._runs[0]
+        run_id = self._parent_run_id if self._config.config.seeds > 1 else run.mlflow_run_id
         if run_id is None or run_id == self._config.study_run_id:
             return
+        folder = above if self._config.config.seeds > 1 else run.folder(self._config.folder)
         values: dict[str, float | None] = {
             "lap_time": ended.lap_time_s,
             "completion": ended.completion,
@@ -333,7 +344,7 @@ class TrialRun(Callback):
         }
         status: Status = "FAILED" if ended.state == "FAIL" else "FINISHED"
         end = f"{ended.state.lower()}: {ended.reason}"
-        end_trial_run(self._config.store, run_id, status, end, trial_metrics(values), RemoteRun)
+        end_trial_run(folder, self._config.store, status, end, trial_metrics(values), self._projector)
 
     def _patiently(self, call: Callable[[], Value]) -> Value:
         return patiently(call, self._config.config.patience_s)

@@ -15,6 +15,7 @@ from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.sweeps.search.pruners import build_pruner
 from deepracer_exp.sweeps.search.samplers import build_sampler
 from deepracer_exp.sweeps.trial import Interrupted, Trial
+from deepracer_exp.tracking.projector import Projector
 from deepracer_exp.training.result import TakenOver
 from deepracer_exp.training.signals import Interruption
 
@@ -35,9 +36,10 @@ _WAIT_S = 1.0
 class Worker:
     """Claims and makes trials of one study, and reports their results."""
 
-    def __init__(self, config: WorkerConfig, storage: RDBStorage, owner: str):
-        """Connect to the study; `owner` is this worker's name."""
+    def __init__(self, config: WorkerConfig, storage: RDBStorage, owner: str, projector: Projector):
+        """Connect to the study; `owner` is this worker's name, and `projector` records its runs."""
         self._config, self._storage, self._owner = config, storage, owner
+        self._projector = projector
         self._claims = TrialClaims(storage.engine, config.study)
         self._cached = optuna.storages.get_storage(storage)
         """The storage, which reads the trials that have ended only once in this process."""
@@ -88,7 +90,9 @@ class Worker:
         lease.confirm()
         trial_id = self._patiently(lambda: self._trial_id(lease.claim.trial.number))
         run = self._patiently(
-            lambda: TrialRun(self._config, self._claims, lease, study, self._storage, trial_id)
+            lambda: TrialRun(
+                self._config, self._claims, lease, study, self._storage, trial_id, self._projector
+            )
         )
         try:
             return run.make()
