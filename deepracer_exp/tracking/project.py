@@ -52,9 +52,8 @@ def serve(lines: Lines) -> None:
             retry_s, pause_s = _FIRST_PAUSE_S, None if projection.is_done else every_s
         else:
             # Jitter, so that processes that began to wait together do not return together.
-            pause_s = min(retry_s, _LAST_PAUSE_S if projection.has_ended else retry_s) + random.uniform(
-                0.0, 0.1
-            )
+            longest_s = _LAST_PAUSE_S if projection.has_ended else _LONGEST_PAUSE_S
+            pause_s = min(retry_s, longest_s) + random.uniform(0.0, 0.1)
             retry_s = min(2 * retry_s, _LONGEST_PAUSE_S)
         try:
             asked = lines.get(timeout=pause_s)

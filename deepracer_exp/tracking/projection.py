@@ -92,8 +92,8 @@ class Projection:
         return problem
 
     def give_up(self, problem: str) -> None:
-        """Note a problem that another attempt would not solve."""
-        self.is_done = True
+        """Note a problem that is nobody's answer; of a run that has ended, nothing more is attempted."""
+        self.is_done = self.has_ended
         with suppress(BadInput):  # whatever else is lost, the folder may be gone
             tracked = read_tracked_run(self.folder)
             self._note(tracked, end_ms=tracked.end_ms, problem=problem)

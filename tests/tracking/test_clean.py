@@ -82,7 +82,7 @@ def test_checkpoints_of_a_recorded_run_stay_while_its_registry_is_not_asked(seas
     assert listed(season) == [("2", SPARE_CHECKPOINTS, ["000010"])]
     assert "tracking.uri" in kept(season)["1"]
     assert len(listed(season, asked=True)) == 2
-    (season.runs_dir / "season" / "1" / "tracking.json").write_text(json.dumps({"run_id": "0" * 32}))
+    (season.runs_dir / "season" / "1" / "mlflow.json").write_text(json.dumps({"run_id": "0" * 32}))
     assert len(listed(season, asked=True)) == 1
 
 
@@ -240,7 +240,9 @@ def test_a_training_or_a_pin_that_came_after_the_survey_is_heeded(season):
     assert not (runs[1] / ".running").exists()
 
 
-@pytest.mark.parametrize("name", ["lineage.json", "checkpoints/pinned.json", "tracking.json", "summary.json"])
+@pytest.mark.parametrize(
+    "name", ["lineage.json", "checkpoints/pinned.json", "tracking.json", "mlflow.json", "summary.json"]
+)
 def test_where_a_file_cannot_be_read_nothing_is_removed(season, call, name):
     season.run("1")
     (season.run("2") / name).write_text("{")

@@ -76,18 +76,18 @@ def test_a_promoted_version_has_metrics_signature_report_and_description(season,
     assert not [path for path in files.rglob("*") if path.suffix in (".pkl", ".pickle", ".pt", ".pth")]
 
 
-TRACKING = "tracking.json"
+RECORDED = "mlflow.json"
 
 
 @pytest.mark.parametrize(
     ("argument", "file", "text", "words"),
     [
         (None, "checkpoints/000020/agent/state.tdz", "?", "corrupt"),
-        (None, TRACKING, None, "is not recorded in MLflow"),
-        (None, TRACKING, '{"run_id": null}', "is not recorded in MLflow"),
-        (None, TRACKING, "[]", "tracking.json"),
-        (None, TRACKING, '{"run_id": 3}', "run_id: 3"),
-        (None, TRACKING, json.dumps({"run_id": "0" * 32}), "not found"),
+        (None, RECORDED, None, "is not recorded in MLflow"),
+        (None, RECORDED, '{"run_id": null}', "is not recorded in MLflow"),
+        (None, RECORDED, "[]", "mlflow.json"),
+        (None, RECORDED, '{"run_id": 3}', "run_id: 3"),
+        (None, RECORDED, json.dumps({"run_id": "0" * 32}), "not found"),
         (None, None, None, "was deleted in MLflow"),
         ("checkpoint=77", None, None, "000077 is not there"),
         ("checkpoint=../x", None, None, "best, last, fastest or the number"),

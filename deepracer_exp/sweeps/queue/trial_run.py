@@ -332,11 +332,13 @@ class TrialRun(Callback):
         """Let MLflow have the trial's result, beside what its runs have logged."""
         if self._config.store is None:
             return
-        run = self._runs[0]
-        run_id = self._parent_run_id if self._config.config.seeds > 1 else run.mlflow_run_id
-        if run_id is None or run_id == self._config.study_run_id:
+        if self._config.config.seeds > 1:
+            folder, is_there = above, self._parent_run_id not in (None, self._config.study_run_id)
+        else:
+            folder = self._runs[0].folder(self._config.folder)
+            is_there = (folder / SUMMARY).exists()
+        if not is_there:
             return
-        folder = above if self._config.config.seeds > 1 else run.folder(self._config.folder)
         values: dict[str, float | None] = {
             "lap_time": ended.lap_time_s,
             "completion": ended.completion,
