@@ -116,10 +116,8 @@ class WandbProjection(LoggerProjection):
         import wandb
         from torchrl.record.loggers import get_logger
 
-        config, run_id = (
-            self._config,
-            re.sub(r"[^A-Za-z0-9_-]", "-", f"{tracked.experiment}-{self.folder.name}")[-128:],
-        )
+        config = self._config
+        run_id = re.sub(r"[^A-Za-z0-9_-]", "-", f"{tracked.experiment}-{self.folder.name}")[-128:]
         offline = config.mode == "offline"
         if offline:  # the new one will have all rows
             for earlier in (self.folder / WANDB).glob(f"offline-run-*-{run_id}"):
@@ -129,13 +127,12 @@ class WandbProjection(LoggerProjection):
             logger_name=str(self.folder),
             experiment_name=tracked.run_name,
             wandb_kwargs={
-                **{
-                    "id": run_id,
-                    "project": config.project,
-                    "entity": config.entity,
-                    "group": tracked.experiment,
-                },
-                **{"offline": offline, "log_env_packages": False},
+                "id": run_id,
+                "project": config.project,
+                "entity": config.entity,
+                "group": tracked.experiment,
+                "offline": offline,
+                "log_env_packages": False,
                 "settings": wandb.Settings(silent=True, console="off"),
             },
         )

@@ -37,15 +37,15 @@ def serve(lines: Lines) -> None:
     """
     projection: Projection | None = None
     every_s, retry_s = 0.0, _FIRST_PAUSE_S
-    asked = lines.get()
-    while asked is not None:
-        if asked:
-            if projection is None and asked["first"] is not None:
-                newer = _begun(lines, Path(asked["first"]), asked["every_s"])
+    line = lines.get()
+    while line is not None:
+        if line:
+            if projection is None and line["first"] is not None:
+                newer = _begun(lines, Path(line["first"]), line["every_s"])
                 if newer is None:
                     return
-                asked = newer or asked
-            projection, every_s, retry_s = _opened(asked), asked["every_s"], _FIRST_PAUSE_S
+                line = newer or line
+            projection, every_s, retry_s = _opened(line), line["every_s"], _FIRST_PAUSE_S
         assert projection is not None
         pause_s: float | None
         if _has_answered(projection):
@@ -56,9 +56,9 @@ def serve(lines: Lines) -> None:
             pause_s = min(retry_s, longest_s) + random.uniform(0.0, 0.1)
             retry_s = min(2 * retry_s, _LONGEST_PAUSE_S)
         try:
-            asked = lines.get(timeout=pause_s)
+            line = lines.get(timeout=pause_s)
         except queue.Empty:
-            asked = {}
+            line = {}
 
 
 def _begun(lines: Lines, first: Path, most_s: float) -> dict[str, Any] | None:
@@ -72,12 +72,12 @@ def _begun(lines: Lines, first: Path, most_s: float) -> dict[str, Any] | None:
     return {}
 
 
-def _opened(asked: dict[str, Any]) -> "Projection":
+def _opened(line: dict[str, Any]) -> "Projection":
     from deepracer_exp.addresses import take_over
 
-    take_over(asked["addresses"])
-    folder, options = Path(asked["folder"]), asked["options"]
-    if asked["kind"] == "mlflow":
+    take_over(line["addresses"])
+    folder, options = Path(line["folder"]), line["options"]
+    if line["kind"] == "mlflow":
         from .projection import MLflowProjection
         from .store import Store
 
@@ -88,7 +88,7 @@ def _opened(asked: dict[str, Any]) -> "Projection":
 
     return (
         TensorBoardProjection(folder)
-        if asked["kind"] == "tensorboard"
+        if line["kind"] == "tensorboard"
         else WandbProjection(WandbTracking(**options), folder)
     )
 
@@ -114,9 +114,13 @@ def _main() -> None:
     # Calls are repeated here; a command, whose user waits, has MLflow's own patience of 120 s.
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")
     lines: Lines = queue.SimpleQueue()
-    threading.Thread(target=serve, args=(lines,), daemon=True).start()
-    for line in sys.stdin:
-        lines.put(json.loads(line))
+    threading.Thread(target=_read, args=(lines,), daemon=True).start()
+    serve(lines)
+
+
+def _read(lines: Lines) -> None:
+    for text in sys.stdin:
+        lines.put(json.loads(text))
     os._exit(0)  # the owner has ended; whatever a call still waits for
 
 

@@ -109,8 +109,8 @@ class Projection:
 
     def _note(self, tracked: TrackedRun, end_ms: int | None, problem: str | None) -> None:
         before = read_recorded(self.folder, self.kind)
-        known = self.run_id or (before.run_id if before.store == tracked.store else None)
-        now = Recorded(tracked.store, known, end_ms, problem)
+        run_id = self.run_id or (before.run_id if before.store == tracked.store else None)
+        now = Recorded(tracked.store, run_id, end_ms, problem)
         if now != before or not (self.folder / f"{self.kind}.json").exists():
             write_recorded(self.folder, now, self.kind)
 
@@ -274,9 +274,9 @@ class MLflowProjection(Projection):
 
     def _tags(self, tracked: TrackedRun) -> dict[str, str]:
         # MLflow's own tags may have been edited in the UI; a group's description has its progress.
-        own = {NOTE} if tracked.group is not None else set()
+        ours = {NOTE} if tracked.group is not None else set()
         tags = {
-            key: value for key, value in tracked.tags.items() if not key.startswith("mlflow.") or key in own
+            key: value for key, value in tracked.tags.items() if not key.startswith("mlflow.") or key in ours
         }
         if tracked.status is not None and tracked.group is None:
             tags |= label_tags(read_labels(self.folder))

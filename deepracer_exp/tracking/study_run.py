@@ -97,7 +97,7 @@ class StudyRun:
         )
         self._store = store
         # Every process that continues a study has one of its own.
-        self._folder = tempfile.TemporaryDirectory(prefix="study-")
+        self._folder = tempfile.TemporaryDirectory(prefix="study-", ignore_cleanup_errors=True)
         self._projector = Projector() if projector is None else projector
         run = TrackedRun(
             f"sweep {study}", study, now_ms(), params, tags, store=store.shown, group=self._group
@@ -131,8 +131,8 @@ class StudyRun:
         )
         counts = ("complete", "pruned", "failed", "env_steps")
         values |= {f"study/{name}": getattr(progress, name) for name in counts}
-        known = {key: float(value) for key, value in values.items() if value is not None}
-        self._change(tags=tags, values=known, values_step=progress.ended, group=self._group)
+        numbers = {key: float(value) for key, value in values.items() if value is not None}
+        self._change(tags=tags, values=numbers, values_step=progress.ended, group=self._group)
 
     def log_report(self, file: Path) -> None:
         """Store the study's page with the run at its end."""
@@ -226,8 +226,8 @@ def end_trial_run(
         # Of a run that is not recorded, `runs send` records this as well.
         waits = before.group is not None or read_recorded(folder).has_all_of(before)
         run = ProjectedRun(folder, before, store, projector)
-        known = {key: value for key, value in values.items() if value is not None}
-        run.change(tags={**before.tags, END_TAG: reason}, values=known, status=status, end_ms=now_ms())
+        numbers = {key: value for key, value in values.items() if value is not None}
+        run.change(tags={**before.tags, END_TAG: reason}, values=numbers, status=status, end_ms=now_ms())
         problem = run.wait_for_end(deadline_s) if waits else None
     except (BadInput, OSError) as error:
         problem = str(error)

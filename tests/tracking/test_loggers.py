@@ -70,7 +70,7 @@ def test_tensorboard_has_the_metrics_under_their_names_in_mlflow(tensorboard, tm
 
 
 def test_a_resumed_run_has_each_row_once_in_tensorboard(tensorboard, tmp_path):
-    record(tensorboard(), ROWS, 3)
+    record(tensorboard(), ROWS, 3, "KILLED")
     found, _ = scalars(tmp_path / TENSORBOARD)
     assert found["train/mean_return"] == [(100, 1.0), (200, 2.0), (300, 3.0)]
     record(tensorboard(), [*ROWS[:2], {**ROWS[2], "mean_return": 7.0}], 3, "FINISHED")

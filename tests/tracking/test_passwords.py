@@ -124,7 +124,7 @@ def test_no_password_reaches_an_output_a_file_a_database_or_mlflow(
     said = []
 
     def run(code: int, *arguments: str, alone: bool = False) -> None:
-        ended = start(*arguments).end(500) if alone else call_at(tmp_path, *arguments)
+        ended = start(*arguments).end() if alone else call_at(tmp_path, *arguments)
         assert ended.code == code, ended.stderr
         said.append(ended.stdout + ended.stderr)
 

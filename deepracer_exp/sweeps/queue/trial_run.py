@@ -105,7 +105,7 @@ class TrialRun(Callback):
             RunFailed: the database has not answered for too long.
         """
         overrides = self._overrides()
-        with TemporaryDirectory(prefix="trial-") as above:
+        with TemporaryDirectory(prefix="trial-", ignore_cleanup_errors=True) as above:
             self._parent_run_id = self._mlflow_parent(overrides, Path(above))
             ended = self._ended(overrides)
             self._track(ended, Path(above))
