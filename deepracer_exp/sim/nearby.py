@@ -44,27 +44,27 @@ class Around(NamedTuple):
     """The K others of each car."""
 
     distance_m: np.ndarray
-    """Along the lap, of all cars' others, (N, K), as `offset_m`."""
+    """How far along the lap the others of all cars are, (N, K), as in `offset_m`."""
     offset_m: np.ndarray
-    """To the left of the centre line."""
+    """How far to the left of the centre line they are."""
     is_bot: np.ndarray
     """Which of the others are cars, (K,)."""
     speeds_mps: np.ndarray
-    """Of the others of the n cars that are asked for, (n, K)."""
+    """Speeds of the others of the n cars that are asked for, (n, K)."""
 
 
 class Here(NamedTuple):
     """Where n cars are: arrays with a row per car."""
 
     distance_m: np.ndarray
-    """Of the front point along the lap."""
+    """How far along the lap the front points are."""
     offset_m: np.ndarray
-    """Of the same to the left of the centre line."""
+    """How far to the left of the centre line they are."""
     speed_mps: np.ndarray
     width_m: np.ndarray
-    """Of the road."""
+    """Width of the road."""
     length_m: np.ndarray
-    """Of the lap."""
+    """Length of the lap."""
 
 
 class Reach(NamedTuple):
@@ -120,17 +120,17 @@ def _list_next(distance_m, own_m, length_m, reach, listed):  # type: ignore[no-u
     """List the next others of a car within reach and their gaps, nearest first; return how many there are."""
     count, behind_m, reach_m, _ = reach
     following, gap_m = listed
-    found = 0
+    filled = 0
     for other in range(len(distance_m)):
         gap = (distance_m[other] - own_m + behind_m) % length_m - behind_m
         if gap >= reach_m:
             continue
-        place = min(found, count - 1)
-        if found == count and gap >= gap_m[place]:
+        place = min(filled, count - 1)
+        if filled == count and gap >= gap_m[place]:
             continue
         while place > 0 and gap < gap_m[place - 1]:
             following[place], gap_m[place] = following[place - 1], gap_m[place - 1]
             place -= 1
         following[place], gap_m[place] = other, gap
-        found = min(found + 1, count)
-    return found
+        filled = min(filled + 1, count)
+    return filled
