@@ -135,10 +135,10 @@ class Starts(NamedTuple):
     """Where episodes begin."""
 
     offset: float
-    """Of the first, and of each after it: shares of the lap."""
+    """Start of the first episode, and what each after it adds: shares of the lap."""
     advance: float
     first_track: np.ndarray
-    """Of each course: index of its track in the first direction, and in how many it is driven, (courses,)."""
+    """For each course: index of its track in the first direction, and in how many it is driven, (courses,)."""
     turns: np.ndarray
 
 
@@ -173,9 +173,9 @@ class Rules(NamedTuple):
     """The rules of a race."""
 
     limits: tuple[int, int, float, int]
-    """Of `EpisodeRules`."""
+    """Limits of `EpisodeRules`."""
     codes: tuple[int, ...]
-    """Those of `rules`, which also has `endings`."""
+    """Codes of `rules`, which also has `endings`."""
     endings: tuple[int, ...]
     lap_terminates: bool
     wheels_m: np.ndarray

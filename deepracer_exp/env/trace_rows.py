@@ -56,10 +56,10 @@ class Lengths(NamedTuple):
     """What all steps have in common."""
 
     waypoints: np.ndarray
-    """Those of `Tracks.waypoints`, as `first_waypoint`."""
+    """Waypoints as in `Tracks.waypoints`, as is `first_waypoint`."""
     first_waypoint: np.ndarray
     length_m: np.ndarray
-    """Of the tracks, (W,)."""
+    """Lengths of the tracks, (W,)."""
     period_s: float
 
 

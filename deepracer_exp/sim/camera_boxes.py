@@ -17,13 +17,13 @@ FACE_LIGHT = (1.0, 0.85, 0.7)
 """Brightness of a box's top, of its front and back, and of its sides, relative to its colour."""
 
 
-class _Found(NamedTuple):
+class _Visible(NamedTuple):
     """The boxes in a picture: arrays with a row per box."""
 
     seen: NDArray[np.float64]
-    """Of the corners, those on the floor first: depth, right and down from the eye, (boxes, 8, 3)."""
+    """Corners, those on the floor first: depth, right and down from the eye, (boxes, 8, 3)."""
     corners: NDArray[np.float64]
-    """On the floor, (boxes, 4, 2)."""
+    """Corners on the floor, (boxes, 4, 2)."""
     columns: NDArray[np.float64]
     """The first and the last of the picture's columns that a box may be in, (boxes, 2)."""
     distance: NDArray[np.float64]
@@ -48,7 +48,7 @@ def draw_boxes(poses, boxes, mounts, out):  # type: ignore[no-untyped-def]
     changes = np.zeros((channels + 1, (height + 3) * width), np.float32)
     running, uncovered = np.empty((channels + 1, width), np.float32), np.empty(width, np.float32)
     rotation = np.empty((3, 3))
-    found = _Found(
+    visible = _Visible(
         np.empty((count, 8, 3)),
         np.empty((count, 4, 2)),
         np.empty((count, 2)),
@@ -58,28 +58,28 @@ def draw_boxes(poses, boxes, mounts, out):  # type: ignore[no-untyped-def]
     for car in range(cars):
         eye, axis, right, down = view(poses[car], mounts[car], rotation)
         camera = eye, axis, right, down, mounts[car, 4]
-        n_left = _find(boxes[car], camera, width, found)
+        n_left = _find(boxes[car], camera, width, visible)
         while n_left > 0:
-            chosen = _choose(found, n_left, eye)
-            box = found.left[chosen]
+            chosen = _choose(visible, n_left, eye)
+            box = visible.left[chosen]
             n_left -= 1
             for place in range(chosen, n_left):
-                found.left[place] = found.left[place + 1]
+                visible.left[place] = visible.left[place + 1]
             bounds = _add_faces(
-                boxes[car, box], found.seen[box], found.corners[box], camera, (height, width), changes
+                boxes[car, box], visible.seen[box], visible.corners[box], camera, (height, width), changes
             )
             _paint(changes, bounds, running, uncovered, out[car])
 
 
 @njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
-def _find(boxes, camera, width, found):  # type: ignore[no-untyped-def]
+def _find(boxes, camera, width, visible):  # type: ignore[no-untyped-def]
     """Find the boxes in a picture, (boxes, 6 + channels), sort them by distance, and return how many there are."""
     eye, axis, right, down, focal = camera
     middle_x = 0.5 * width
     # Of the planes through the picture's left and right edges: the normal's parts along the axis and across.
     side_axis = middle_x / np.hypot(middle_x, focal)
     side_across = focal / np.hypot(middle_x, focal)
-    seen, corners, columns, distance, left = found
+    seen, corners, columns, distance, left = visible
     n_left = 0
     for box in range(len(boxes)):
         top = np.float64(boxes[box, 5])
@@ -128,9 +128,9 @@ def _find(boxes, camera, width, found):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
-def _choose(found, n_left, eye):  # type: ignore[no-untyped-def]
+def _choose(visible, n_left, eye):  # type: ignore[no-untyped-def]
     """Return the place of the first box that hides none of the others; if each of them hides another, the farthest."""
-    _, corners, columns, distance, left = found
+    _, corners, columns, distance, left = visible
     for candidate in range(n_left):
         box, hides = left[candidate], False
         for place in range(n_left):
@@ -147,7 +147,7 @@ def _choose(found, n_left, eye):  # type: ignore[no-untyped-def]
 def _add_faces(box, seen, corners, camera, size, changes):  # type: ignore[no-untyped-def]
     """Add the edges of a box's visible faces; return the first column that they change and the one after the last.
 
-    The same of the rows follows. `seen` and `corners` are those of `_Found`.
+    The same of the rows follows. `seen` and `corners` are those of `_Visible`.
     """
     height, width = size
     eye, focal = camera[0], camera[4]

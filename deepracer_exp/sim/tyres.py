@@ -200,9 +200,9 @@ class Clock(NamedTuple):
     """A physics step of a control period."""
 
     step: int
-    """Its number, from 0."""
+    """Number of the step, from 0."""
     steps: int
-    """How many there are."""
+    """Number of steps in the period."""
     dt_s: float
     """Length of one."""
 

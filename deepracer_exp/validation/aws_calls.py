@@ -29,7 +29,7 @@ def main() -> None:
     The steps are `started`, `load`, `signature`, each situation and `imports`; the result is what is wrong, or null.
     The process is killed in a step that takes more than its CPU time, whatever the function catches.
     """
-    asked = json.load(sys.stdin)
+    request = json.load(sys.stdin)
     output = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # what the function writes is no result
 
@@ -38,28 +38,28 @@ def main() -> None:
         output.flush()
 
     answer("started")
-    module = _Module(asked)
+    module = _Module(request)
     wrong = module.load()
     answer("load", wrong)
     if wrong is not None:
         return
     answer("signature", module.signature())
     loaded: list[str] | None = None
-    for situation, params in asked["situations"].items():
+    for situation, params in request["situations"].items():
         before = set(sys.modules)
         answer(situation, module.call(_as_in_python(params)))
         if loaded is None:
             loaded = [name for name in sys.modules if name not in before]
-    first = next(iter(asked["situations"].values()))
-    answer("imports", {"lines": _Module(asked).executed_lines(_as_in_python(first)), "loaded": loaded})
+    first = next(iter(request["situations"].values()))
+    answer("imports", {"lines": _Module(request).executed_lines(_as_in_python(first)), "loaded": loaded})
 
 
 class _Module:
     """A reward module in a namespace of its own."""
 
-    def __init__(self, asked: dict[str, Any]) -> None:
-        self._path, self._limit_s, self._most = asked["path"], asked["limit_s"], asked["most"]
-        self._code = compile(asked["text"], self._path, "exec", dont_inherit=True)
+    def __init__(self, request: dict[str, Any]) -> None:
+        self._path, self._limit_s, self._most = request["path"], request["limit_s"], request["most"]
+        self._code = compile(request["text"], self._path, "exec", dont_inherit=True)
         self._namespace: dict[str, Any] = {"__name__": "reward_function", "print": _format}
 
     def load(self) -> str | None:

@@ -54,7 +54,7 @@ def dry_run_findings(source: RewardSource, track: Track) -> list[AwsFinding]:
 
 def _answers(source: RewardSource, situations: dict[str, dict[str, Any]]) -> tuple[dict[str, Any], str]:
     """Return the result of each step of `aws_calls` that it came to, and how the process ended."""
-    asked = {
+    request = {
         "path": source.path,
         "text": source_with_constants(source),
         "limit_s": _LIMIT_S,
@@ -62,7 +62,7 @@ def _answers(source: RewardSource, situations: dict[str, dict[str, Any]]) -> tup
         "situations": situations,
     }
     command = [sys.executable, "-P", "-m", _MODULE]
-    stdin = json.dumps(asked, default=np.ndarray.tolist).encode()
+    stdin = json.dumps(request, default=np.ndarray.tolist).encode()
     try:
         process = subprocess.run(command, input=stdin, capture_output=True, timeout=_LONGEST_S, check=False)
     except subprocess.TimeoutExpired as error:
