@@ -15,11 +15,11 @@ from deepracer_exp.config.running import WandbTracking
 from deepracer_exp.runs.files import TENSORBOARD, WANDB
 
 from .metrics import recordable_values
-from .projection import Projection, files_to_keep
+from .projection import RunProjection, files_to_keep
 from .tracking_file import TrackedRun
 
 
-class LoggerProjection(Projection):
+class LoggerProjection(RunProjection):
     """What a logger of TorchRL has of a run; each process that records the run opens one of its own."""
 
     def __init__(self, folder: Path) -> None:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .projection import Projection
+    from .projection import RunProjection
 
 Lines = queue.SimpleQueue[dict[str, Any] | None]
 
@@ -35,7 +35,7 @@ def serve(lines: Lines) -> None:
     updates of a server that answers, and `first`, a file after which recording begins, or null; it is not waited for
     longer than until the second update would be due.
     """
-    projection: Projection | None = None
+    projection: RunProjection | None = None
     every_s, retry_s = 0.0, _FIRST_PAUSE_S
     line = lines.get()
     while line is not None:
@@ -72,7 +72,7 @@ def _begun(lines: Lines, first: Path, most_s: float) -> dict[str, Any] | None:
     return {}
 
 
-def _opened(line: dict[str, Any]) -> "Projection":
+def _opened(line: dict[str, Any]) -> "RunProjection":
     from deepracer_exp.addresses import take_over
 
     take_over(line["addresses"])
@@ -93,7 +93,7 @@ def _opened(line: dict[str, Any]) -> "Projection":
     )
 
 
-def _has_answered(projection: "Projection") -> bool:
+def _has_answered(projection: "RunProjection") -> bool:
     """Bring a tracker up to date; return whether that need not be repeated because its server did not answer."""
     from deepracer_exp.errors import BadInput
 

@@ -50,7 +50,7 @@ def files_to_keep(run_dir: Path) -> list[tuple[Path, str | None]]:
     return [(path, folder) for path, folder in files if path.exists()]
 
 
-class Projection:
+class RunProjection:
     """What a tracker has of the run of a folder; a class of its own for each kind of tracker.
 
     Only rows of metrics.jsonl that a checkpoint covers are recorded, so that no resumed run contradicts them, and all
@@ -141,7 +141,7 @@ class Projection:
         return int(name) if name.isdecimal() else 0
 
 
-class MLflowProjection(Projection):
+class MLflowProjection(RunProjection):
     """The MLflow run of a run folder. MLflow is asked which points it has of a run that another process recorded.
 
     Attributes:

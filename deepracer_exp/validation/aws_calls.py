@@ -23,7 +23,7 @@ _TRACED = 10.0
 """Time limit of a call whose lines are recorded, over that of a plain call."""
 
 
-def main() -> None:
+def _main() -> None:
     """Read from stdin what to call, and write a line of JSON to stdout after each step: its name and result.
 
     The steps are `started`, `load`, `signature`, each situation and `imports`; the result is what is wrong, or null.
@@ -144,4 +144,4 @@ def _format(*values: object, **_: object) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    _main()

@@ -11,7 +11,7 @@ from deepracer_exp.runs.files import TENSORBOARD, WANDB
 from deepracer_exp.tracking.delivery import undelivered
 from deepracer_exp.tracking.loggers import TensorBoardProjection, WandbProjection
 from deepracer_exp.tracking.metrics import METRICS, metric_name
-from deepracer_exp.tracking.projection import Projection
+from deepracer_exp.tracking.projection import RunProjection
 from deepracer_exp.tracking.tracking_file import TrackedRun, write_tracked_run
 from tests.conftest import IN_PROCESS
 
@@ -24,7 +24,7 @@ ROWS = [
 ]
 
 
-def record(projection: Projection, rows, covered: int, status=None, laps=()) -> None:
+def record(projection: RunProjection, rows, covered: int, status=None, laps=()) -> None:
     """Project a folder with these rows, of which a checkpoint covers some; then their last laps, and the end."""
     folder = projection.folder
     (folder / "metrics.jsonl").unlink(missing_ok=True)
