@@ -74,11 +74,6 @@ def test_nothing_of_other_libraries_differs_from_a_process_without_this_package(
     } <= functions.keys()
     functions_without, process_without = state_of_libraries(theirs, list(functions))
     assert functions == functions_without
-    # Settings of MLflow, which only the tracker reads.
-    environment = process["environment"]
-    process["environment"] = {
-        name: environment[name] for name in environment if not name.startswith("MLFLOW_")
-    }
     assert process == process_without
 
 

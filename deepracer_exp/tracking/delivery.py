@@ -15,7 +15,7 @@ from .calls import StoreRefusedError, StoreUnavailableError
 from .metadata import NAME, USER_NOTE, label_tags
 from .metrics import now_ms, points_at
 from .projection import MLflowProjection
-from .store import has_store, open_client, resolve_store
+from .store import has_store, open_client, prepare_mlflow, resolve_store
 from .tracking_file import Status, read_recorded, read_tracked_run, write_tracked_run
 
 ENDS: dict[str, Status] = {FINISHED: "FINISHED", STOPPED_EARLY: "FINISHED", FAILED: "FAILED"}
@@ -78,6 +78,7 @@ def deliver_evaluation(
     try:
         if recorded is not None and not store.is_named(recorded):
             raise StoreRefusedError(f"its run is in {recorded}; give tracking.uri={recorded}")
+        prepare_mlflow()
         from .mlflow_run import MLflowRun
 
         run = MLflowRun(store)

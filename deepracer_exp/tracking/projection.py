@@ -33,7 +33,7 @@ from deepracer_exp.runs.labels import read_labels
 from .calls import StoreRefusedError, StoreUnavailableError
 from .metadata import END_TAG, KIND, NOTE, STUDY, label_tags
 from .metrics import Point, now_ms, points_at, points_of, recordable_values, without_evaluation
-from .store import Store
+from .store import Store, prepare_mlflow
 from .tracking_file import REFUSED, Recorded, TrackedRun, read_recorded, read_tracked_run, write_recorded
 
 if TYPE_CHECKING:
@@ -191,6 +191,7 @@ class MLflowProjection(RunProjection):
 
     def _opened(self, tracked: TrackedRun) -> "MLflowRun":
         if self._run is None:
+            prepare_mlflow()
             from .mlflow_run import MLflowRun
 
             run, recorded = MLflowRun(self._store), read_recorded(self.folder)

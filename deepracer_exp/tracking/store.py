@@ -33,14 +33,6 @@ if TYPE_CHECKING:
     from mlflow import MlflowClient
     from mlflow.store.artifact.artifact_repo import ArtifactRepository
 
-# MLflow reads this at each call and offers no parameter. Its own 7 retries would hold the queue for minutes after a
-# server is back: `project.serve` retries instead.
-os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
-# It would print the address of each ended run, with its password.
-os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
-# Without a network it would be retried during the whole run.
-os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-
 ARTIFACTS = "mlflow-artifacts"
 """The folder, in `runs_dir`, of the files that MLflow keeps of runs in a database of this machine."""
 _SERVERS = ("http", "https")
@@ -226,6 +218,16 @@ def check_database_file(file: Path, shown: str) -> None:
         raise BadInput(shown, f"{file} cannot be written; choose a writable place")
 
 
+def prepare_mlflow() -> None:
+    """Set what MLflow reads from the environment alone, some of it when it is imported."""
+    # Its own 7 retries would hold the queue for minutes after a server is back: `project.serve` retries instead.
+    os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
+    # It would print the address of each ended run, with its password.
+    os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
+    # Without a network it would be retried during the whole run.
+    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+
+
 def silence_mlflow() -> None:
     """Silence MLflow's loggers, which its import sets up.
 
@@ -248,6 +250,7 @@ def client_of(store: Store) -> "MlflowClient":
             os.environ.pop(name, None)
         else:
             os.environ[name] = value
+    prepare_mlflow()
     from mlflow import MlflowClient
 
     silence_mlflow()

@@ -213,7 +213,7 @@ def test_nothing_in_the_package_unpickles_and_only_rewards_are_executed(path):
     assert not calls & DANGEROUS
     for words in ("weights_only=False", "allow_pickle=True", "shell=True"):
         assert words not in text
-    if path.name != "reward.py":
+    if path.name != "time_limit.py":  # `run_module`, for reward functions
         assert not calls & {"eval", "exec"}
 
 
