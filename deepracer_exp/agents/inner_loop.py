@@ -10,7 +10,7 @@ import functools
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -39,6 +39,37 @@ and the norm is that before clipping."""
 
 # Sums may be reordered; NaN and infinity must stay what they are, since they end a run.
 compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "arcp", "nsz"})
+
+
+class Steps(NamedTuple):
+    """Steps that are learned from, N in a row."""
+
+    observation: Floats
+    """[N, features]."""
+    action: NDArray[Any]
+    """[N, 2] float32, or int64 [N] of a discrete policy."""
+    log_prob: Floats
+    """Logarithm of the action's probability or density when it was collected, [N]."""
+    advantage: Floats
+    target: Floats
+    """Target of the value network, [N]."""
+
+
+class Scale(NamedTuple):
+    """The logarithm of a continuous policy's standard deviation, (2,), empty of a discrete one, and its gradient."""
+
+    log_std: Floats
+    by_log_std: Floats
+
+
+class Loss(NamedTuple):
+    """What the loss is made of."""
+
+    entropy_coeff: float
+    critic_coeff: float
+    clip_epsilon: float
+    huber: bool
+    """Whether the value loss is Huber's, not the mean squared error."""
 
 
 class InnerLoop:
@@ -82,39 +113,35 @@ class InnerLoop:
         """
         config = self._config
         policy, value = (self._arrays(layers, size) for layers in self._layers)
-        log_std, by_log_std = _NO_SCALE, _NO_SCALE
+        scale = Scale(_NO_SCALE, _NO_SCALE)
         if self._log_std is not None:
-            log_std, by_log_std = self._log_std.detach().numpy(), self.gradients[self._log_std]
+            scale = Scale(self._log_std.detach().numpy(), self.gradients[self._log_std])
         moments, taken = self._moments()
-        arrays = tuple(column.numpy() for column in columns)
-        numbers = (entropy_coeff, config.critic_coeff, config.clip_epsilon)
-        adam = (lr, config.max_grad_norm or math.inf, self._optimizer.defaults["eps"])
+        steps = Steps(*(column.numpy() for column in columns))
+        loss = Loss(entropy_coeff, config.critic_coeff, config.clip_epsilon, config.loss_type == "huber")
+        adam = (lr, config.max_grad_norm or math.inf, self._optimizer.defaults["eps"], taken)
         epoch = _epoch if threads == 1 else self._epoch_of_two
         _limit_products()
-        table, made = epoch(
-            arrays, size, policy, value, log_std, by_log_std, moments, numbers, adam,
-            config.loss_type == "huber", taken,
-        )  # fmt: skip
+        table, made = epoch(steps, size, (policy, value, scale), loss, moments, adam)
         for parameter in self._networks.parameters():
             self._optimizer.state[parameter]["step"] += made
         return torch.from_numpy(table[:made])
 
-    def _epoch_of_two(  # type: ignore[no-untyped-def]
-        self, columns, size, policy, value, log_std, by_log_std, moments, numbers, adam, huber, taken
-    ) -> tuple[Floats, int]:
+    def _epoch_of_two(self, steps, size, networks, loss, moments, adam) -> tuple[Floats, int]:  # type: ignore[no-untyped-def]
         """Do what `_epoch` does, bit for bit, with the value network on a thread of its own.
 
         The threads sleep while one waits for the other: waiting in a loop, as OpenMP does, takes away the core that
         the other needs on a busy machine.
         """
-        minibatches = len(columns[0]) // size
+        policy, value, scale = networks
+        minibatches = len(steps.action) // size
         table = np.zeros((minibatches, len(COLUMNS)), np.float32)
         for number in range(minibatches):
-            row, first = table[number], number * size
-            values = self._second.submit(_value_gradient, columns, first, size, value, numbers, huber, row)
-            _policy_gradient(columns, first, size, policy, log_std, by_log_std, numbers, row)
+            row, minibatch = table[number], _minibatch(steps, number * size, size)
+            values = self._second.submit(_value_gradient, minibatch, value, loss, row)
+            _policy_gradient(minibatch, policy, scale, loss, row)
             values.result()
-            if not _step(moments, adam, taken + number + 1, row):
+            if not _step(moments, adam, number, row):
                 return table, number
         return table, minibatches
 
@@ -188,54 +215,61 @@ def outputs_of(linear: Sequence[nn.Linear], rows: int) -> tuple[Floats, ...]:
 
 
 @njit(cache=True, nogil=True)
-def _epoch(columns, size, policy, value, log_std, by_log_std, moments, numbers, adam, huber, taken):  # type: ignore[no-untyped-def]
-    """Make the gradient steps; return the table of `COLUMNS` and how many rows of it were made."""
-    minibatches = len(columns[0]) // size
+def _epoch(steps, size, networks, loss, moments, adam):  # type: ignore[no-untyped-def]
+    """Make the gradient steps; return the table of `COLUMNS` and how many rows of it were made.
+
+    `networks` are arrays of policy and value network (`InnerLoop._arrays`) and the policy's `Scale`; `adam` are the
+    learning rate, the largest norm, epsilon and the steps made so far.
+    """
+    policy, value, scale = networks
+    minibatches = len(steps.action) // size
     table = np.zeros((minibatches, len(COLUMNS)), np.float32)
     for number in range(minibatches):
-        row, first = table[number], number * size
-        _policy_gradient(columns, first, size, policy, log_std, by_log_std, numbers, row)
-        _value_gradient(columns, first, size, value, numbers, huber, row)
-        if not _step(moments, adam, taken + number + 1, row):
+        row, minibatch = table[number], _minibatch(steps, number * size, size)
+        _policy_gradient(minibatch, policy, scale, loss, row)
+        _value_gradient(minibatch, value, loss, row)
+        if not _step(moments, adam, number, row):
             return table, number
     return table, minibatches
 
 
 @njit(cache=True, nogil=True)
-def _policy_gradient(columns, first, size, policy, log_std, by_log_std, numbers, row):  # type: ignore[no-untyped-def]
-    """Fill the policy's gradients, and its part of the row of `COLUMNS`."""
-    observation, action, log_prob, advantage, _ = columns
-    entropy_coeff, _, clip_epsilon = numbers
+def _minibatch(steps, first, size):  # type: ignore[no-untyped-def]
+    """Return `size` of the steps from the `first` on."""
     rows = slice(first, first + size)
-    outputs = _forward(observation[rows], policy)
-    _differentiate(
-        outputs, action[rows], log_prob[rows], advantage[rows], log_std, by_log_std, clip_epsilon,
-        entropy_coeff, policy[6][-1], row,
+    return Steps(
+        steps.observation[rows], steps.action[rows], steps.log_prob[rows], steps.advantage[rows],
+        steps.target[rows],
     )  # fmt: skip
-    _backward(observation[rows], policy)
 
 
 @njit(cache=True, nogil=True)
-def _value_gradient(columns, first, size, value, numbers, huber, row):  # type: ignore[no-untyped-def]
+def _policy_gradient(steps, policy, scale, loss, row):  # type: ignore[no-untyped-def]
+    """Fill the policy's gradients, and its part of the row of `COLUMNS`."""
+    outputs = _forward(steps.observation, policy)
+    row[0], row[2], row[3], row[4] = _differentiate(outputs, policy[6][-1], steps.action, steps, scale, loss)
+    _backward(steps.observation, policy)
+
+
+@njit(cache=True, nogil=True)
+def _value_gradient(steps, value, loss, row):  # type: ignore[no-untyped-def]
     """Fill the value network's gradients, and its part of the row of `COLUMNS`."""
-    observation, target = columns[0], columns[4]
-    rows = slice(first, first + size)
-    outputs = _forward(observation[rows], value)
-    row[1] = _value_loss(outputs, target[rows], huber, numbers[1], value[6][-1])
-    _backward(observation[rows], value)
+    outputs = _forward(steps.observation, value)
+    row[1] = _value_loss(outputs, value[6][-1], steps.target, loss)
+    _backward(steps.observation, value)
 
 
 @njit(cache=True, nogil=True)  # reordered, the test for finite numbers would find NaN finite
 def _step(moments, adam, number, row):  # type: ignore[no-untyped-def]
-    """Make gradient step `number`, counted from 1; return whether losses and gradients were finite and it was made."""
-    lr, max_norm, epsilon = adam
+    """Make a gradient step, `number` of the epoch; return whether losses and gradients were finite and it was made."""
+    lr, max_norm, epsilon, taken = adam
     norm = _norm(moments[1])
     row[5] = norm
     if not np.isfinite(norm + row[0] + row[1] + row[2]):
         return False
     # As torch.nn.utils.clip_grads_with_norm_ does.
     share = min(1.0, max_norm / (norm + 1e-6))
-    _adam(moments, np.float32(share), lr, number, epsilon)
+    _adam(moments, np.float32(share), lr, taken + number + 1, epsilon)
     return True
 
 
@@ -344,33 +378,28 @@ def log_sum(logits):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _differentiate(  # type: ignore[no-untyped-def]
-    outputs,
-    action,
-    log_prob,
-    advantage,
-    log_std,
-    by_log_std,
-    clip_epsilon,
-    entropy_coeff,
-    by_outputs,
-    row,
-):
+def _differentiate(outputs, by_outputs, action, steps, scale, loss):  # type: ignore[no-untyped-def]
     """Differentiate the clipped loss and the entropy bonus by the policy's outputs and the logarithm of its scale.
+
+    `action` is that of the steps: an argument, whose dimensions numba knows. Returns the loss, the entropy, the share
+    of clipped ratios and the divergence.
 
     Source of the loss: Schulman et al. 2017, arXiv 1707.06347, equation 7.
     """
     count, size = outputs.shape
+    log_prob, advantage = steps.log_prob, steps.advantage
+    entropy_coeff, clip_epsilon = loss.entropy_coeff, loss.clip_epsilon
+    log_std, by_log_std = scale
     low, high = math.log1p(-clip_epsilon), math.log1p(clip_epsilon)
-    loss = entropy = clipped = kl = 0.0
+    policy_loss = entropy = clipped = kl = 0.0
     if action.ndim == 2:
         by_log_std[:] = -entropy_coeff
-        scale = limited_log_std(log_std)
+        log_scale = limited_log_std(log_std)
         for axis in range(size):
-            entropy += scale[axis] + 0.5 + _HALF_LOG_2PI
+            entropy += log_scale[axis] + 0.5 + _HALF_LOG_2PI
     for step in range(count):
         if action.ndim == 2:
-            now = log_density(action[step], outputs[step], scale)
+            now = log_density(action[step], outputs[step], log_scale)
         else:
             normal = log_sum(outputs[step])
             now = outputs[step, action[step]] - normal
@@ -381,13 +410,13 @@ def _differentiate(  # type: ignore[no-untyped-def]
         least = math.exp(limited) * advantage[step]
         inside = limited == log_ratio
         by_log_prob = -gain / count if inside or gain <= least else 0.0
-        loss -= min(gain, least)
+        policy_loss -= min(gain, least)
         clipped += not inside
         # E[r - 1 - log r] for r = new / old probability: never negative, and far less noisy than E[-log r].
         kl += ratio - 1.0 - log_ratio
         if action.ndim == 2:
             for axis in range(size):
-                shrink = math.exp(-scale[axis])
+                shrink = math.exp(-log_scale[axis])
                 apart = (action[step, axis] - outputs[step, axis]) * shrink
                 by_outputs[step, axis] = by_log_prob * apart * shrink
                 by_log_std[axis] += by_log_prob * (apart * apart - 1.0)
@@ -406,13 +435,14 @@ def _differentiate(  # type: ignore[no-untyped-def]
         for axis in range(size):
             if log_std[axis] < _LEAST_LOG_STD:
                 by_log_std[axis] = 0.0
-    row[0], row[2], row[3], row[4] = loss / count, entropy, clipped / count, kl / count
+    return policy_loss / count, entropy, clipped / count, kl / count
 
 
 @compiled
-def _value_loss(values, target, huber, weight, by_values):  # type: ignore[no-untyped-def]
+def _value_loss(values, by_values, target, loss):  # type: ignore[no-untyped-def]
     """Differentiate the loss of the values by them, and return it."""
     count, total = len(target), 0.0
+    huber, weight = loss.huber, loss.critic_coeff
     for step in range(count):
         error = values[step, 0] - target[step]
         if huber and abs(error) >= 1.0:
