@@ -67,7 +67,9 @@ def add_derived(steps: pd.DataFrame, course: Track | None, discount: float) -> p
     first = first_rows(steps)
     lap_position, offset_m, center_deg = _places(steps, first, course)
     stopped = first & ~flying_rows(steps)
-    derived = dict(zip(_MOVED, _moved(x, y, yaw, time_s, progress, first, stopped, center_deg), strict=True))
+    derived = dict(
+        zip(_MOVED, _moved((x, y, yaw), time_s, progress, first, stopped, center_deg), strict=True)
+    )
     faster, slower = _change(derived["track_speed_mps"], time_s, stopped)
     derived |= {
         "lap_clock_s": _lap_clock(steps, stopped, first, derived["delta_time_s"]),
@@ -93,8 +95,9 @@ _MOVED = (
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _moved(x, y, yaw, time_s, progress, first, stopped, center_deg):  # type: ignore[no-untyped-def]
+def _moved(poses, time_s, progress, first, stopped, center_deg):  # type: ignore[no-untyped-def]
     """Return the columns `_MOVED` of what happened since the row before, (8, n)."""
+    x, y, yaw = poses
     out = np.full((8, len(x)), np.nan)
     since, apart = np.zeros((4, len(x))), stopped.copy()
     before_x = before_y = 0.0

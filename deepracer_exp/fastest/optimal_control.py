@@ -6,6 +6,7 @@ road is an augmented Lagrangian (Howell, Jackson and Manchester, "ALTRO", IROS 2
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,6 +20,29 @@ _POSE = 3
 """The first entries of a state, on which the road depends."""
 _NUDGE = 1e-5
 _DAMP_SPEED, _DAMP_STEERING, _DAMP_ALONG, _DAMP_ACROSS, _DAMP_YAW = 0.01, 0.1, 0.05, 1.0, 0.1
+
+
+class Motion(NamedTuple):
+    """What moves a car."""
+
+    cars: np.ndarray
+    """The record of one car, (1,)."""
+    drives: np.ndarray
+    clock: tuple[int, float]
+    """Physics steps of a control period, and seconds of one."""
+
+
+class Aim(NamedTuple):
+    """What commands are improved towards, besides distance."""
+
+    limits: np.ndarray
+    """Lowest and highest speed and steering, (2, 2)."""
+    multipliers: np.ndarray
+    """Multiplier of the road's border at each state, (n + 1,)."""
+    stiffness: float
+    """How fast the cost of a wheel beside the road grows."""
+    calm: np.ndarray
+    """Cost of a change of speed and of steering, (2,)."""
 
 
 @njit(cache=True)
@@ -99,16 +123,16 @@ def _penalty(short_m, multiplier, stiffness):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _cost(problem, states, commands, multipliers, stiffness, calm):  # type: ignore[no-untyped-def]
+def _cost(problem, states, commands, aim):  # type: ignore[no-untyped-def]
     course, front_point_m, com_x_m, wheels_m, begin_m, closed, margin_m = problem
     total = -driven_m(course, front_point_m, com_x_m, states, begin_m, closed)[-1]
     # An open course ends with its road.
     for n in range(1, len(states) - (not closed)):
         short_m = margin_m - clearance_m(course, wheels_m, com_x_m, states[n])
-        total += _penalty(short_m, multipliers[n], stiffness)[0]
+        total += _penalty(short_m, aim.multipliers[n], aim.stiffness)[0]
     for n in range(len(commands)):
         for k in range(2):
-            total += 0.5 * calm[k] * (commands[n, k] - states[n, 8 - k]) ** 2
+            total += 0.5 * aim.calm[k] * (commands[n, k] - states[n, 8 - k]) ** 2
     return total
 
 
@@ -156,11 +180,13 @@ def _limited(hessian, gradient, low, high, change, free):  # type: ignore[no-unt
 
 
 @njit(cache=True)
-def _backward(  # type: ignore[no-untyped-def]
-    problem, states, commands, limits, multipliers, stiffness, calm, damping, by_state, by_command, step, gain
-):
+def _backward(problem, driven, aim, damping, derivatives, changes):  # type: ignore[no-untyped-def]
     """Write the change of each command, (n, 2), and its reaction to a change of the state, (n, 2, 15)."""
     course, front_point_m, com_x_m, wheels_m, _, closed, margin_m = problem
+    states, commands = driven
+    limits, multipliers, stiffness, calm = aim
+    by_state, by_command = derivatives
+    step, gain = changes
     size = states.shape[1]
     periods = len(commands)
     slope, bend = np.zeros(size), np.zeros((size, size))
@@ -238,46 +264,22 @@ def _backward(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def improve(  # type: ignore[no-untyped-def]
-    cars,
-    drives,
-    problem,
-    states,
-    commands,
-    limits,
-    multipliers,
-    stiffness,
-    calm,
-    damping,
-    rounds,
-    steps,
-    dt_s,
-):
-    """Improve commands in place and return the damping with which to resume."""
+def improve(motion, problem, driven, aim, damping, rounds):  # type: ignore[no-untyped-def]
+    """Improve the `driven` states, (n + 1, 15), and commands, (n, 2), in place; return the damping to resume with."""
+    cars, drives, clock = motion
+    states, commands = driven
+    limits = aim.limits
     periods, size = len(commands), states.shape[1]
     by_state, by_command = np.empty((periods, size, size)), np.empty((periods, size, 2))
     step, gain = np.empty((periods, 2)), np.empty((periods, 2, size))
     new_states, new_commands = states.copy(), commands.copy()
-    cost = _cost(problem, states, commands, multipliers, stiffness, calm)
+    cost = _cost(problem, states, commands, aim)
     stale = True
     for _ in range(rounds):
         if stale:
-            linearise(cars, drives, states[:-1], commands, (steps, dt_s), (by_state, by_command))
+            linearise(cars, drives, states[:-1], commands, clock, (by_state, by_command))
             stale = False
-        _backward(
-            problem,
-            states,
-            commands,
-            limits,
-            multipliers,
-            stiffness,
-            calm,
-            damping,
-            by_state,
-            by_command,
-            step,
-            gain,
-        )
+        _backward(problem, driven, aim, damping, (by_state, by_command), (step, gain))
         share, improved = 1.0, False
         for _ in range(4):
             for n in range(periods):
@@ -286,8 +288,8 @@ def improve(  # type: ignore[no-untyped-def]
                     for j in range(size):
                         value += gain[n, k, j] * (new_states[n, j] - states[n, j])
                     new_commands[n, k] = min(max(value, limits[0, k]), limits[1, k])
-                advance(cars, drives, new_states[n], new_commands[n], (steps, dt_s), new_states[n + 1])
-            new_cost = _cost(problem, new_states, new_commands, multipliers, stiffness, calm)
+                advance(cars, drives, new_states[n], new_commands[n], clock, new_states[n + 1])
+            new_cost = _cost(problem, new_states, new_commands, aim)
             if new_cost < cost - 1e-7:
                 improved = True
                 break

@@ -25,7 +25,7 @@ from deepracer_exp.tracks.line_time import evenly
 from deepracer_exp.tracks.segments import Geometry
 from deepracer_exp.tracks.track import Track
 
-from .optimal_control import clearance_m, driven_m, improve, origin
+from .optimal_control import Aim, Motion, clearance_m, driven_m, improve, origin
 
 Floats = NDArray[np.float64]
 OnRound = Callable[[float, float | None], None]
@@ -216,10 +216,9 @@ class Search:
         pull, damping, firm = np.zeros(len(states)), 1.0, effort.soft
         best, since = _Plan(commands, False, False, 0.0), 0
         for number in range(effort.rounds):
-            damping = improve(
-                self._cars, self._drive, problem, states, commands, self._limits, pull, firm,
-                _CALM * _FADE**number, min(damping, _MOST_DAMPING), _STEPS, self._car.substeps, self._dt_s,
-            )  # fmt: skip
+            motion = Motion(self._cars, self._drive, (self._car.substeps, self._dt_s))
+            aim = Aim(self._limits, pull, firm, _CALM * _FADE**number)
+            damping = improve(motion, problem, (states, commands), aim, min(damping, _MOST_DAMPING), _STEPS)
             driven = self._driven_m(states, begin_m)
             room_m = np.array(
                 [clearance_m(problem.course, problem.wheels_m, problem.com_x_m, state) for state in states]

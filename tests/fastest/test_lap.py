@@ -11,7 +11,7 @@ from deepracer_exp.env.rules import lap_clock_s
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.fastest import lap as fastest
 from deepracer_exp.fastest.lap import FastestLap, Question, fastest_lap, kept_lap
-from deepracer_exp.fastest.optimal_control import _backward
+from deepracer_exp.fastest.optimal_control import Aim, _backward
 from deepracer_exp.fastest.search import Search
 from deepracer_exp.tracks.track import Track
 
@@ -167,8 +167,7 @@ def test_the_search_is_compiled_without_a_warning():
     states, commands = np.zeros((periods + 1, 15)), np.zeros((periods, 2))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        njit(_backward.py_func)(
-            search._problem(0.0), states, commands, np.array([[0.1, -0.5], [4.0, 0.5]]), np.zeros(periods + 1),
-            100.0, np.ones(2), 1.0, np.zeros((periods, 15, 15)), np.zeros((periods, 15, 2)),
-            np.zeros((periods, 2)), np.zeros((periods, 2, 15)),
-        )  # fmt: skip
+        aim = Aim(np.array([[0.1, -0.5], [4.0, 0.5]]), np.zeros(periods + 1), 100.0, np.ones(2))
+        derivatives = np.zeros((periods, 15, 15)), np.zeros((periods, 15, 2))
+        changes = np.zeros((periods, 2)), np.zeros((periods, 2, 15))
+        njit(_backward.py_func)(search._problem(0.0), (states, commands), aim, 1.0, derivatives, changes)

@@ -52,7 +52,9 @@ class Grid:
     def of(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.intp]:
         """Return the cell of each point (n,): row by row from the lower left; -1 where it is outside."""
         x, y = (np.ascontiguousarray(values, np.float64) for values in (x, y))
-        cells: NDArray[np.intp] = _cells(x, y, self.low_x, self.low_y, self.side_m, self.columns, self.rows)
+        cells: NDArray[np.intp] = _cells(
+            x, y, (self.low_x, self.low_y), self.side_m, (self.columns, self.rows)
+        )
         return cells
 
     @property
@@ -72,7 +74,8 @@ class Grid:
 
 
 @njit(cache=True, nogil=True)
-def _cells(x, y, low_x, low_y, side_m, columns, rows):  # type: ignore[no-untyped-def]
+def _cells(x, y, low, side_m, shape):  # type: ignore[no-untyped-def]
+    (low_x, low_y), (columns, rows) = low, shape
     cells = np.full(len(x), -1, np.intp)
     for i in range(len(x)):
         column, row = math.floor((x[i] - low_x) / side_m), math.floor((y[i] - low_y) / side_m)
