@@ -92,7 +92,7 @@ class RunProjection:
         return problem
 
     def give_up(self, problem: str) -> None:
-        """Note a problem that is nobody's answer; of a run that has ended, nothing more is attempted."""
+        """Record a problem that no retry would mend; of a run that has ended, nothing more is attempted."""
         self.is_done = self.has_ended
         with suppress(BadInput):  # whatever else is lost, the folder may be gone
             tracked = read_tracked_run(self.folder)

@@ -25,7 +25,7 @@ class Group:
     """What only a run has that stands above others: a study's above its trials', a trial's above its seeds'."""
 
     marks: tuple[str, ...]
-    """Tags that identify it: a run of its experiment with the same values is continued, whoever has created it."""
+    """Tags that identify it: a run of its experiment with the same values is continued, whichever process began it."""
     lock: str | None = None
     """File that one process at a time locks while it looks for the run and creates it."""
     experiment_tags: dict[str, str] = field(default_factory=dict)
