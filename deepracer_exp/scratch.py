@@ -1,12 +1,14 @@
-"""What a command keeps outside of its run folder while it runs: temporary files.
+"""What a command keeps outside of its run folder while it runs: temporary files and semaphores.
 
-They lie in a folder of the command's own, so that the next command can clear away what a killed one has left.
+The files lie in a folder of the command's own, so that the next command can clear away what a killed one has left.
 """
 
 import atexit
 import fcntl
 import os
+import re
 import shutil
+import signal
 import tempfile
 import uuid
 from collections.abc import Iterator
@@ -14,18 +16,21 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 _PREFIX = "deepracer_exp-"
+_SEMAPHORE = re.compile(r"sem\.mp-[a-z0-9_]{8}")
+"""What the semaphores of Python's `multiprocessing` are called; TorchRL makes four for cars in several processes."""
 _LONGEST_BASE = 50
 """Bytes of the path above: the name of a fork server's socket, 55 below it, has at most 107 (unix(7))."""
 
 
 def own_scratch() -> None:
-    """Keep the temporary files of this process in a folder that ends with it; clear away those of killed processes.
+    """Keep the temporary files of this process in a folder that ends with it; clear away what killed processes left.
 
     What it starts through `multiprocessing` uses the folder, too. Other programs do not: Ray finds its cluster in the
     usual one.
     """
     base = Path(tempfile.gettempdir())
     clear(base, _PREFIX)
+    clear_semaphores(Path("/dev/shm"))
     if len(os.fsencode(base)) > _LONGEST_BASE:
         return
     with suppress(OSError):
@@ -66,6 +71,28 @@ def clear(parent: Path, prefix: str) -> None:
                 if os.fstat(opened).st_uid == os.getuid():
                     fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     shutil.rmtree(folder)
+            finally:
+                os.close(opened)
+
+
+def clear_semaphores(folder: Path) -> None:
+    """Remove this user's semaphores of `multiprocessing` that no process has open; of no effect but on Linux.
+
+    Python's resource tracker removes them, unless it is killed as well. Until then the process that made one has it
+    open, so that one that nobody has open is of no use to anybody.
+    """
+    for file in folder.glob("sem.mp-*"):
+        if not _SEMAPHORE.fullmatch(file.name):
+            continue
+        with suppress(OSError):  # in use
+            opened = os.open(file, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+            try:
+                if os.fstat(opened).st_uid == os.getuid():
+                    # A lease to read is refused as long as any process, also of another container, can write: fcntl(2).
+                    # Who opens the file meanwhile causes a signal, which would be SIGIO and end this process.
+                    fcntl.fcntl(opened, fcntl.F_SETSIG, signal.SIGCHLD)
+                    fcntl.fcntl(opened, fcntl.F_SETLEASE, fcntl.F_RDLCK)
+                    file.unlink()
             finally:
                 os.close(opened)
 

@@ -157,12 +157,17 @@ class Started:
         """Return the command and all that it has started, in whatever session or below whatever parent they are."""
         return [process for process in psutil.process_iter() if _is_marked(process, self._mark)]
 
+    def note_shared_memory(self) -> set[Path]:
+        """Return what its processes have in shared memory by a name; `assert_nothing_left` expects that it is gone."""
+        self.workers()
+        return set(self._shm)
+
     def workers(self) -> list[psutil.Process]:
         """Return the processes forked for the collector or the sweep, in the order of their start."""
         found = []
         for process in self.processes():
             try:
-                self._shm |= _shared_memory(process)
+                self._shm |= shared_memory(process)
                 parent = process.parent()
                 if _is_fork(process) and parent is not None and _is_fork(parent):
                     found.append(process)
@@ -249,13 +254,20 @@ def _is_marked(process: psutil.Process, mark: str) -> bool:
         return False
 
 
-def _shared_memory(process: psutil.Process) -> set[Path]:
+def shared_memory(process: psutil.Process) -> set[Path]:
     """Return the files in shared memory that a process has mapped and that have a name."""
     try:
-        mapped = {Path(region.path) for region in process.memory_maps()}
-    except psutil.AccessDenied:
+        lines = Path(f"/proc/{process.pid}/maps").read_text().splitlines()
+    except OSError:  # it has ended
         return set()
-    return {path for path in mapped if path.is_relative_to("/dev/shm") and path.exists()}
+    # The path is of no use: a semaphore is named after it is mapped.
+    inodes = {int(line.split()[4]) for line in lines if "/dev/shm/" in line}
+    found = set()
+    for file in Path("/dev/shm").iterdir() if inodes else ():
+        with contextlib.suppress(FileNotFoundError):  # another process has removed it
+            if file.stat().st_ino in inodes:
+                found.add(file)
+    return found
 
 
 @pytest.fixture

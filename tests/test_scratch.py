@@ -1,10 +1,19 @@
 """What killed commands have left is cleared away, and nothing else."""
 
+import multiprocessing
 import os
+import sys
+from pathlib import Path
 
+import psutil
 import pytest
 
-from deepracer_exp.scratch import clear, folder_aside
+from deepracer_exp.scratch import clear, clear_semaphores, folder_aside
+
+from .conftest import shared_memory
+
+SHM = Path("/dev/shm")
+on_linux = pytest.mark.skipif(sys.platform != "linux", reason="semaphores have files on Linux only")
 
 
 def test_a_folder_is_cleared_with_what_is_in_it(tmp_path):
@@ -28,3 +37,51 @@ def test_a_folder_that_is_made_aside_is_whole_while_it_is_in_use_and_gone_after(
     with folder_aside(tmp_path, ".made-") as first, folder_aside(tmp_path, ".made-") as second:
         assert sorted(tmp_path.iterdir()) == sorted([first, second])
     assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def semaphores():
+    """Make files named as semaphores in shared memory, opened by nobody, and remove what is left of them."""
+    made = []
+
+    def make(name: str) -> Path:
+        made.append(SHM / name)
+        made[-1].write_bytes(bytes(32))
+        return made[-1]
+
+    yield make
+    for file in made:
+        file.unlink(missing_ok=True)
+
+
+@on_linux
+def test_a_semaphore_that_no_process_has_open_is_removed(semaphores):
+    killed = semaphores("sem.mp-test_k1l")
+    clear_semaphores(SHM)
+    assert not killed.exists()
+
+
+@on_linux
+def test_a_semaphore_in_use_is_left_alone():
+    lock = multiprocessing.get_context("spawn").Lock()
+    in_use = shared_memory(psutil.Process())
+    clear_semaphores(SHM)
+    assert in_use
+    assert all(file.exists() for file in in_use)
+    del lock
+
+
+@on_linux
+def test_nothing_else_in_shared_memory_is_removed(semaphores):
+    others = [semaphores(f"{name}.test-{os.getpid()}") for name in ("sem", "sem.mp-test_k2l", "torch")]
+    clear_semaphores(SHM)
+    assert all(other.exists() for other in others)
+
+
+@on_linux
+@pytest.mark.skipif(os.getuid() != 0, reason="only root may give a file away")
+def test_a_semaphore_of_another_user_is_left_alone(semaphores):
+    other = semaphores("sem.mp-test_k3l")
+    os.chown(other, 12345, 12345)
+    clear_semaphores(SHM)
+    assert other.exists()
