@@ -67,7 +67,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         epilog=_EXPORT_EPILOG,
         entry=None,
     )
-    add_run(parser, "format=onnx|aws|aws-model|car | KEY=VALUE")
+    add_run(parser, "format=onnx|aws|aws-model|car|car-openvino | KEY=VALUE")
     parser.add_argument(
         "-o", "--output", help="file or folder to write (default: in the run's folder, export/)"
     )
@@ -132,7 +132,7 @@ def _import_model(args: argparse.Namespace) -> int:
     return 0
 
 
-_FORMATS = ("onnx", "car", "aws", "aws-model")
+_FORMATS = ("onnx", "car", "car-openvino", "aws", "aws-model")
 _EXPORT_EPILOG = """\
   deepracer-exp export RUN format=onnx                      the network as one file, checked against itself
   deepracer-exp export RUN format=onnx checkpoint=last -o policy.onnx
@@ -143,6 +143,7 @@ _EXPORT_EPILOG = """\
                                                             deepracer-for-cloud and deepracer-on-aws
   deepracer-exp export RUN format=car -o my_model.tar.gz    for the console of a physical car, which calls it my_model;
                                                             needs a policy that sees with the camera
+  deepracer-exp export RUN format=car-openvino              and the graph as cars of Ubuntu 24.04 convert it
 """
 
 
@@ -161,9 +162,9 @@ def _export(args: argparse.Namespace) -> int:
     if format not in _FORMATS:
         raise BadInput(f"format={format}", "no such format", ", ".join(_FORMATS))
     run = stores.find(name)
-    if format in ("onnx", "car", "aws-model"):
+    if format != "aws":
         run = run.with_policy(stores.values.get("checkpoint"))
-    if format == "car":
+    if format in ("car", "car-openvino"):
         from deepracer_exp.env.real_car import check_car
 
         check_car(run.experiment)

@@ -2,6 +2,7 @@
 
 import json
 import shlex
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -50,24 +51,35 @@ class Rescaling(NamedTuple):
 class CarArchive(NamedTuple):
     """What is uploaded to a car."""
 
-    content: bytes
+    files: Mapping[str, bytes]
+    """Content by name, in the order in which they are packed."""
     metadata: ModelMetadata
     notes: list[str]
     """One for each change, and for each thing that the car does differently."""
 
+    def content(self) -> bytes:
+        """Return the .tar.gz."""
+        return tar_gz(self.files)
 
-def export_car(run: StoredRun, path: Path) -> Written:
-    """Write the archive of a policy for a physical car; arguments, result and errors as for `export.Writer`."""
+
+def export_car(
+    run: StoredRun, path: Path, add: Callable[[CarArchive], CarArchive] = lambda archive: archive
+) -> Written:
+    """Write the archive of a policy for a physical car, with what `add` adds to it.
+
+    Arguments, result and errors as for `export.Writer`.
+    """
     if not path.name.endswith(ENDING) or path.is_dir():
         raise BadInput(
             f"--output {path}", "", f"a file whose name ends in {ENDING}, as the car's console wants it"
         )
     stored = run.read_policy()
-    archive = car_archive(stored.networks, run.experiment)
-    write_file(path, archive.content)
+    archive = add(car_archive(stored.networks, run.experiment))
+    content = archive.content()
+    write_file(path, content)
     return [path], [
         checkpoint_line(stored),
-        f"model        {name_on_car(path.name)} on the car, {len(archive.content) / 1e6:.1f} MB",
+        f"model        {name_on_car(path.name)} on the car, {len(content) / 1e6:.1f} MB",
         f"reads        {', '.join(archive.metadata.sensor)}",
         *archive.notes,
         "What the car makes of the actions, with its maximum speed at 100%:",
@@ -128,7 +140,7 @@ def car_archive(networks: PolicyNetworks, experiment: Experiment) -> CarArchive:
     if observation.lidar is not None:
         values["lidar_config"] = _lidar_config(observation.lidar)
     text = json.dumps(values, indent=2) + "\n"
-    return CarArchive(tar_gz({METADATA: text.encode(), GRAPH: graph}), metadata, notes)
+    return CarArchive({METADATA: text.encode(), GRAPH: graph}, metadata, notes)
 
 
 def car_actions(actions: ActionSpace) -> tuple[ModelMetadata, Rescaling | None]:

@@ -1,11 +1,10 @@
 """The archive of a policy in OpenVINO, as the software of a physical car converts and runs it.
 
-Source: deepracer-custom-car 2.1.9.9 (model_optimizer_node.py: weights are stored in half precision;
-intel_ov_inference_eng.cpp: one picture at a time, in half precision where the processor has instructions for it).
+Source: deepracer-custom-car 2.1.9.9 (model_optimizer_node.py: weights are stored in half precision, and a model.xml of
+OpenVINO 2022 or later that lies beside model.pb is taken as it is; intel_ov_inference_eng.cpp: one picture at a time,
+height, width and channels in this order, in half precision where the processor has instructions for it).
 """
 
-import io
-import tarfile
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,13 +19,18 @@ from torch import Tensor
 from deepracer_exp.aws.models.car_archive import GRAPH
 from deepracer_exp.aws.models.graph_def import INPUTS, POLICY
 from deepracer_exp.aws.models.model_metadata import ModelMetadata
+from deepracer_exp.errors import BadInput
+from deepracer_exp.lookup.resolve import StoredRun
 
-from .car_archive import CarArchive
+from .car_archive import CarArchive, export_car
 from .onnx import DeployedPolicy
+from .written import Written
 
 SAME = 0.01
 """Share of the range of steering or speed up to which two commands are the same."""
 NEEDED = "pip install 'deepracer-exp[car]'"
+MODEL, WEIGHTS = "agent/model.xml", "agent/model.bin"
+"""The graph in OpenVINO's intermediate representation, beside it: 11, its version since OpenVINO 2022."""
 
 Floats = NDArray[np.floating[Any]]
 
@@ -54,6 +58,34 @@ def has_openvino() -> bool:
     return True
 
 
+def export_car_openvino(run: StoredRun, path: Path) -> Written:
+    """Write the archive for a car with the graph converted; arguments, result and errors as for `export.Writer`."""
+    if not has_openvino():
+        raise BadInput(
+            "format=car-openvino", f"needs the package openvino; install the project with its extra: {NEEDED}"
+        )
+    return export_car(run, path, add_converted)
+
+
+def add_converted(archive: CarArchive) -> CarArchive:
+    """Return an archive with `MODEL` and `WEIGHTS` in it, which the car would make of its graph."""
+    import openvino
+
+    with tempfile.TemporaryDirectory() as folder:
+        graph, model, weights = (Path(folder, Path(name).name) for name in (GRAPH, MODEL, WEIGHTS))
+        graph.write_bytes(archive.files[GRAPH])
+        # The converter that its Python package offers does the same, but reports each conversion to its makers.
+        converted = openvino.Core().read_model(graph)
+        converted.reshape({each: [1, *list(each.partial_shape)[1:]] for each in converted.inputs})
+        openvino.save_model(converted, model, compress_to_fp16=True)
+        files = {MODEL: model.read_bytes(), WEIGHTS: weights.read_bytes()}
+    note = (
+        f"{MODEL} and {WEIGHTS}: a car with OpenVINO 2024 (Ubuntu 24.04) that has them beside model.pb converts "
+        "nothing; an upload in its console leaves them behind"
+    )
+    return archive._replace(files={**archive.files, **files}, notes=[*archive.notes, note])
+
+
 def run_in_openvino(archive: CarArchive, seen: Sequence[Tensor]) -> Floats:
     """Return what the graph in an archive gives in OpenVINO, (n, outputs).
 
@@ -63,10 +95,7 @@ def run_in_openvino(archive: CarArchive, seen: Sequence[Tensor]) -> Floats:
     """
     import openvino
 
-    with tarfile.open(fileobj=io.BytesIO(archive.content)) as packed:
-        file = packed.extractfile(GRAPH)
-        assert file is not None
-        graph = file.read()
+    files = (archive if MODEL in archive.files else add_converted(archive)).files
     fed = {
         f"{INPUTS}/{sensor}/{sensor}:0": (
             values.permute(0, 2, 3, 1) if values.dtype == torch.uint8 else values
@@ -74,15 +103,8 @@ def run_in_openvino(archive: CarArchive, seen: Sequence[Tensor]) -> Floats:
         for sensor, values in zip(archive.metadata.sensor, seen, strict=True)
     }
     core = openvino.Core()
-    with tempfile.TemporaryDirectory() as folder:
-        frozen, converted = Path(folder, "model.pb"), Path(folder, "model.xml")
-        frozen.write_bytes(graph)
-        # The converter that its Python package offers does the same, but reports each conversion to its makers.
-        model = core.read_model(frozen)
-        model.reshape({name: [1, *values.shape[1:]] for name, values in fed.items()})
-        openvino.save_model(model, converted, compress_to_fp16=True)
-        settings = {"INFERENCE_PRECISION_HINT": "f16", "INFERENCE_NUM_THREADS": 1}
-        compiled = core.compile_model(converted, "CPU", settings)
+    settings = {"INFERENCE_PRECISION_HINT": "f16", "INFERENCE_NUM_THREADS": 1}
+    compiled = core.compile_model(core.read_model(files[MODEL], files[WEIGHTS]), "CPU", settings)
     rows = [
         compiled({name: values[[row]].astype(np.float32) for name, values in fed.items()})[f"{POLICY}:0"][0]
         for row in range(len(seen[0]))

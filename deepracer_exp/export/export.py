@@ -11,6 +11,7 @@ from deepracer_exp.runs.files import EXPORTS
 from .aws_files import export_files
 from .aws_model import export_model
 from .car_archive import export_car, name_in_exports
+from .car_converter import export_car_openvino
 from .onnx import export_onnx
 from .written import Written
 
@@ -23,6 +24,7 @@ file differs from the network.
 WRITERS: Mapping[str, tuple[Writer, Callable[[StoredRun], str]]] = {
     "onnx": (export_onnx, lambda run: "policy.onnx"),
     "car": (export_car, name_in_exports),
+    "car-openvino": (export_car_openvino, name_in_exports),
     "aws": (export_files, lambda run: "aws"),
     "aws-model": (export_model, lambda run: "aws-model"),
 }

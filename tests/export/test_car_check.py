@@ -107,7 +107,7 @@ def test_a_converter_that_is_not_installed_is_no_fault():
 def printed(found, columns, is_terminal):
     experiment, _ = compose_experiment(["experiment=real_car"])
     config = compose_evaluation(["evaluation=real_car"])[0].evaluation
-    archive = CarArchive(b"", car_actions(ACTIONS)[0], ["a note that does not fit a line of a terminal " * 3])
+    archive = CarArchive({}, car_actions(ACTIONS)[0], ["a note that does not fit a line of a terminal " * 3])
     file = io.StringIO()
     out = Console(file=file, width=columns, force_terminal=is_terminal, color_system=None)
     print_check(found, archive, experiment, config, out)

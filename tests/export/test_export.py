@@ -44,7 +44,7 @@ def test_what_the_console_would_refuse_of_a_reward_is_reported(trained, call, tm
         (["nowhere", "format=onnx"], "nowhere: no such run"),
         (
             ["nowhere", "format=coreml"],
-            "format=coreml: no such format; accepted: onnx, car, aws, aws-model",
+            "format=coreml: no such format; accepted: onnx, car, car-openvino, aws, aws-model",
         ),
         (
             ["nowhere", "format=onnx", "chekpoint=last"],

@@ -69,8 +69,8 @@ def sensor_notes(sensors: tuple[str, ...]) -> list[str]:
         )
     if len(sensors) > 1:
         notes.append(
-            f"{' and '.join(sensors)}: deepracer-custom-car with OpenVINO 2024 takes the two in random order, "
-            "and in one of the two orders fails to load the model; a restart draws again"
+            f"{' and '.join(sensors)}: deepracer-custom-car with OpenVINO 2024 takes the two in random order "
+            "when it converts the model, and fails in one of the two; a restart draws again"
         )
     if "LIDAR" in sensors:
         notes.append(
