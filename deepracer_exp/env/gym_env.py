@@ -1,10 +1,13 @@
-"""Gymnasium environments; importing this module registers `DeepRacer-v0`.
+"""Gymnasium environments; importing this module registers `DeepRacer-v0` and, for each track, `DeepRacer/TRACK-v0`.
 
 import gymnasium
 import deepracer_exp.env.gym_env
 
-env = gymnasium.make("DeepRacer-v0", overrides=["track=Oval_track"])
+env = gymnasium.make("DeepRacer/Oval_track-v0")
 cars = gymnasium.make_vec("DeepRacer-v0", num_envs=64, overrides=["action_space=continuous"])
+
+An id stands for the default experiment, of the track it names. A change after which results of the same id no longer
+compare raises its version.
 """
 
 from collections.abc import Sequence
@@ -17,6 +20,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from deepracer_exp.aws.worlds.catalogue import worlds
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.errors import BadInput
 from deepracer_exp.sim.lidar import FURTHEST_M
@@ -46,18 +50,21 @@ class DeepRacerEnv(gym.Env[Observed, Any]):
 
     metadata = _METADATA
 
-    def __init__(self, overrides: Sequence[str] = (), render_mode: str | None = None):
+    def __init__(
+        self, overrides: Sequence[str] = (), render_mode: str | None = None, track: str | None = None
+    ):
         """Compose an experiment and put its car on the track.
 
         Args:
             overrides: as for `deepracer-exp train`.
             render_mode: `rgb_array`, or None for no pictures.
+            track: an option of the group track, unless an override has another; None: the default's.
 
         Raises:
             BadInput: an override or a file it names is not accepted, or there is no such mode.
         """
         self.render_mode = _checked(render_mode)
-        setup = refuse_rivals(build_setup(compose_experiment(overrides)[0]), _KIND)
+        setup = refuse_rivals(_composed(track, overrides), _KIND)
         self._race = Race(setup, 1)
         self._weights = [course.weight for course in setup.courses]
         self._courses = deal(self._weights)
@@ -109,6 +116,7 @@ class DeepRacerVectorEnv(VectorEnv[Observed, NDArray[Any], NDArray[Any]]):
         threads: int = 1,
         setup: RaceSetup | None = None,
         render_mode: str | None = None,
+        track: str | None = None,
     ):
         """Compose an experiment and put its cars on the track.
 
@@ -116,14 +124,15 @@ class DeepRacerVectorEnv(VectorEnv[Observed, NDArray[Any], NDArray[Any]]):
             num_envs: number of cars.
             overrides: as for `deepracer-exp train`.
             threads: physics threads; 0 means one per core.
-            setup: the race, if it is built already; replaces `overrides`.
+            setup: the race, if it is built already; replaces `overrides` and `track`.
             render_mode: `rgb_array`, or None for no pictures.
+            track: an option of the group track, unless an override has another; None: the default's.
 
         Raises:
             BadInput: an override or a file it names is not accepted, or there is no such mode.
         """
         self.render_mode = _checked(render_mode)
-        setup = refuse_rivals(setup or build_setup(compose_experiment(overrides)[0]), _KIND)
+        setup = refuse_rivals(setup or _composed(track, overrides), _KIND)
         if num_envs < len(setup.courses):
             raise BadInput(
                 f"num_envs={num_envs} with {len(setup.courses)} tracks: every track needs a car; accepted: at "
@@ -178,6 +187,10 @@ class DeepRacerVectorEnv(VectorEnv[Observed, NDArray[Any], NDArray[Any]]):
         return None if self.render_mode is None else tuple(map(self._view.picture, range(self.num_envs)))
 
 
+def _composed(track: str | None, overrides: Sequence[str]) -> RaceSetup:
+    return build_setup(compose_experiment([*([] if track is None else [f"track={track}"]), *overrides])[0])
+
+
 def _checked(render_mode: str | None) -> str | None:
     accepted = _METADATA["render_modes"]
     if render_mode not in (None, *accepted):
@@ -207,8 +220,17 @@ def _spaces(race: Race) -> tuple[spaces.Space[Any], spaces.Space[Any]]:
     return observation, spaces.Discrete(n_actions)
 
 
-gym.register(
-    id="DeepRacer-v0",
-    entry_point="deepracer_exp.env.gym_env:DeepRacerEnv",
-    vector_entry_point="deepracer_exp.env.gym_env:DeepRacerVectorEnv",
-)
+def _register(name: str, **kwargs: str) -> None:
+    here = "deepracer_exp.env.gym_env"
+    gym.register(
+        f"{name}-v0",
+        entry_point=f"{here}:DeepRacerEnv",
+        vector_entry_point=f"{here}:DeepRacerVectorEnv",
+        kwargs=kwargs,
+    )
+
+
+_register("DeepRacer")
+# Tracks of the working folder have no id: it would not mean the same to others.
+for _track in worlds():
+    _register(f"DeepRacer/{_track}", track=_track)

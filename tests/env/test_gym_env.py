@@ -10,6 +10,8 @@ from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
+from benchmarks.all_tracks import TRACKS
+from deepracer_exp.aws.worlds.catalogue import worlds
 from deepracer_exp.env.gym_env import DeepRacerEnv, DeepRacerVectorEnv
 from deepracer_exp.env.sb3 import DeepRacerVecEnv
 from deepracer_exp.env.trace import EPISODE_STATUS
@@ -18,15 +20,45 @@ from deepracer_exp.errors import BadInput
 SPACES = ["action_space=discrete", "action_space=continuous"]
 
 
-@pytest.mark.parametrize("space", SPACES)
-def test_gymnasiums_checker_finds_nothing(space):
-    env = gym.make("DeepRacer-v0", overrides=[space]).unwrapped
+def _objections(env):
+    """Return what Gymnasium's checker finds wrong with an environment."""
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         check_env(env)
     # Offsets and look-ahead points have no bounds; made with keywords, and unwrapped, on purpose.
     known = ("minimum value is -infinity", "maximum value is infinity", "A Box observation space m")
-    assert [str(w.message) for w in found if not any(part in str(w.message) for part in known)] == []
+    return [str(w.message) for w in found if not any(part in str(w.message) for part in known)]
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_gymnasiums_checker_finds_nothing(space):
+    assert _objections(gym.make("DeepRacer-v0", overrides=[space]).unwrapped) == []
+
+
+@pytest.mark.parametrize("track", TRACKS)
+def test_gymnasiums_checker_finds_nothing_on_the_track_of_an_id(track):
+    env = gym.make(f"DeepRacer/{track}-v0").unwrapped
+    assert env._race.setup.track.name == track
+    assert _objections(env) == []
+
+
+def test_every_track_of_the_catalogue_has_an_id_and_no_other_name_has():
+    named = {spec.name for spec in gym.registry.values() if spec.namespace == "DeepRacer"}
+    assert named == set(worlds())
+    with pytest.raises(gym.error.NameNotFound, match="Did you mean: `Monaco`"):
+        gym.make("DeepRacer/Monacoo-v0")
+
+
+def test_overrides_leave_the_track_of_an_id_as_it_is_unless_they_name_another():
+    def driven(**kwargs):
+        return gym.make_vec("DeepRacer/Straight_track-v0", num_envs=2, **kwargs).unwrapped
+
+    discrete = driven(overrides=SPACES[:1])
+    assert (discrete._race.setup.track.name, discrete.single_action_space.n > 1) == ("Straight_track", True)
+    single = driven(vectorization_mode="sync", overrides=SPACES[:1])
+    assert isinstance(single, SyncVectorEnv)
+    np.testing.assert_array_equal(single.reset(seed=0)[0][0], discrete.reset(seed=0)[0][0])
+    assert driven(overrides=["track=Oval_track"])._race.setup.track.name == "Oval_track"
 
 
 def test_a_car_alone_drives_as_in_the_race(race_of):
