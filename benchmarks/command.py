@@ -36,6 +36,20 @@ def train(overrides: Sequence[str], folder: Path, command: str = "train") -> Pat
     return summary.parent
 
 
+def run_benchmark(name: str, *arguments: str) -> dict[str, Any]:
+    """Run `python -m benchmarks.NAME` and return the JSON of its last line.
+
+    Raises:
+        SystemExit: it did not end with exit code 0; the message is its own.
+    """
+    line = [sys.executable, "-m", f"benchmarks.{name}", *arguments]
+    done = subprocess.run(line, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise SystemExit(f"{' '.join(line)}: exit code {done.returncode}\n{done.stderr}")
+    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return found
+
+
 def trained(folder: Path, overrides: Sequence[str]) -> Path:
     """Return a finished run of these overrides in `folder`; train if there is none."""
     for summary in sorted(folder.glob("runs/*/*/summary.json")):

@@ -36,9 +36,13 @@ class Driven:
     """The same, with friction, noise and the like that it was not trained on."""
     held_out_lap_time_s: float | None
 
+    def figures(self) -> dict[str, float | None]:
+        """Return the figures for JSON."""
+        return {key: None if value is None else round(value, 4) for key, value in asdict(self).items()}
+
     def named(self, which: str) -> dict[str, float | None]:
         """Return the figures for JSON, `which` in their names: completion_kept."""
-        return {f"{key}_{which}": None if v is None else round(v, 4) for key, v in asdict(self).items()}
+        return {f"{key}_{which}": value for key, value in self.figures().items()}
 
 
 def protocol(*overrides: str) -> EvaluationConfig:

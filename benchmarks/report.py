@@ -105,17 +105,24 @@ def interval_text(figure: dict[str, Any], show: Callable[[float | None], str]) -
 
 
 def over_seeds(values: Sequence[float | None]) -> dict[str, Any]:
-    """Return `seeds`, the values, and their `iqm` (interquartile mean) with its bootstrap `interval`, for JSON.
+    """Return `seeds`, the values, with what `over_strata` finds of them."""
+    return {"seeds": list(values), **over_strata([values])}
 
-    None is longer than any number; so is null in the mean and the interval.
+
+def over_strata(strata: Sequence[Sequence[float | None]]) -> dict[str, Any]:
+    """Return the `iqm` (interquartile mean) of all values with its bootstrap `interval`, for JSON.
+
+    Args:
+        strata: values of the seeds of each track. None is longer than any number; so is null in the mean and the
+            interval.
     """
-    found = estimate([np.array([math.inf if value is None else value for value in values])])
+    found = estimate([np.array([math.inf if v is None else v for v in values]) for values in strata])
     ends = None if found.interval is None else [_finite(end) for end in found.interval]
-    return {"seeds": list(values), "iqm": _finite(found.iqm), "interval": ends}
+    return {"iqm": _finite(found.iqm), "interval": ends}
 
 
 def iqm_text(figure: dict[str, Any], show: Callable[[float | None], str]) -> str:
-    """Return what `over_seeds` found, for a table."""
+    """Return what `over_strata` found, for a table."""
     middle, *ends = map(show, (figure["iqm"], *(figure["interval"] or ())))
     return f"{middle} ({' to '.join(ends)})" if ends else middle
 

@@ -5,7 +5,7 @@
 
 For each seed, track and list of actions, `deepracer-exp train` runs with `algorithm=ppo` and with `algorithm=sac`, all
 cars in one process and one thread, until its minutes are over; with continuous actions (it has no SAC for others)
-`benchmarks.sb3_sac` follows, with the hyperparameters of `algorithm=sac`. Trainings that are compared begin one after
+`benchmarks.sb3_timed` follows, with the hyperparameters of `algorithm=sac`. Trainings that are compared begin one after
 the other, `--jobs` of them at once, so that what else the machine does is about the same for them.
 
 JSON has in `rows` one for each track, actions and algorithm (`ppo`, `sac`, `sb3_sac`). Its figures have a value for
@@ -15,8 +15,8 @@ is longer than any:
 - `reliable_steps`, `reliable_s`: until 90% of the last 50 training episodes were complete laps; seconds count from the
   first control step and include evaluations and checkpoints, of which Stable-Baselines3 makes none;
 - `steps`, `train_s`: of the whole training; `steps_per_s`;
-- `lap_s`, `lap_share`: mean time and share of the complete ones of 64 fresh laps on usual conditions, driven by the
-  best checkpoint, of Stable-Baselines3 by its last policy.
+- `lap_time_s`, `lap_share`: mean time and share of the complete ones of 64 fresh laps on usual conditions, driven by
+  the best checkpoint, of Stable-Baselines3 by its last policy.
 
 `--runs-dir DIR` leaves the runs in DIR and takes those that it finds finished there: an interrupted benchmark
 continues.
@@ -24,7 +24,6 @@ continues.
 
 import argparse
 import json
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
@@ -36,7 +35,7 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import atomic_write
 
-from .command import at_once, read_metrics, read_summary, trained
+from .command import at_once, read_metrics, run_benchmark, trained
 from .fresh import drive
 from .report import benchmark_parser, iqm_text, number, over_seeds, percent, table, with_exit_code, write_json
 
@@ -44,7 +43,7 @@ TRACKS = ("reinvent_base", "reInvent2019_track", "Spain_track")
 ACTIONS = ("continuous", "discrete_fast")
 PEER = "sb3_sac"
 LAP_SHARE = 0.9
-FIGURES = ("reliable_steps", "reliable_s", "steps", "train_s", "steps_per_s", "lap_s", "lap_share")
+FIGURES = ("reliable_steps", "reliable_s", "steps", "train_s", "steps_per_s", "lap_time_s", "lap_share")
 _ALWAYS = (
     *("stopping=none", "budget.env_steps=null", "checkpoints.metric=reliable_lap"),
     *("collector=in_process", "collector.threads=1", "tracking=off", "report=false"),
@@ -58,29 +57,28 @@ class Asked(NamedTuple):
     actions: str
     """Option of conf/action_space."""
     algorithm: str
-    """Option of conf/algorithm, or `PEER`."""
+    """Option of conf/algorithm, with the prefix `sb3_` that of Stable-Baselines3."""
 
     def overrides(self, minutes: float, own: Sequence[str]) -> list[str]:
         """Return the overrides of `deepracer-exp train`."""
-        algorithm = "sac" if self.algorithm == PEER else self.algorithm
+        algorithm = f"algorithm={self.algorithm.removeprefix('sb3_')}"
         return [
-            *(f"track={self.track}", f"action_space={self.actions}", f"algorithm={algorithm}"),
+            *(f"track={self.track}", f"action_space={self.actions}", algorithm),
             *(*_ALWAYS, f"budget.minutes={minutes:g}", *own),
         ]
 
 
-def measure(run: Path) -> dict[str, float | None]:
-    """Return the figures of a run."""
-    summary = read_summary(run)
-    reliable = next((row for row in read_metrics(run) if (row["lap_share"] or 0.0) >= LAP_SHARE), {})
-    (driven,) = drive(run, [None])
+def measure(run: Path, checkpoint: str | None = None) -> dict[str, float | None]:
+    """Return the figures of a run; its laps are those of a checkpoint, None: the best."""
+    rows = read_metrics(run)
+    reliable = next((row for row in rows if (row["lap_share"] or 0.0) >= LAP_SHARE), {})
+    (driven,) = drive(run, [checkpoint])
     return {
         "reliable_steps": reliable.get("env_steps"),
         "reliable_s": reliable.get("wall_clock_s"),
-        "steps": summary["env_steps"],
-        "train_s": summary["wall_clock_s"],
-        "lap_s": driven.lap_time_s,
-        "lap_share": driven.lap_share,
+        "steps": rows[-1]["env_steps"],
+        "train_s": rows[-1]["wall_clock_s"],
+        **driven.figures(),
     }
 
 
@@ -101,15 +99,11 @@ def peer(folder: Path, overrides: Sequence[str], minutes: float) -> dict[str, fl
         stored = json.loads(file.read_text(encoding="utf-8"))
         if stored["asked"] == asked:
             return dict(stored["figures"])
-    line = [sys.executable, "-m", f"benchmarks.{PEER}", "--seconds", f"{60 * minutes:g}", *overrides]
-    done = subprocess.run(line, capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        raise SystemExit(f"{' '.join(line)}: exit code {done.returncode}\n{done.stderr}")
-    figures = json.loads(done.stdout.splitlines()[-1])
+    figures = run_benchmark("sb3_timed", "--seconds", f"{60 * minutes:g}", *overrides)
     folder.mkdir(parents=True, exist_ok=True)
     atomic_write(file, json.dumps({"asked": asked, "figures": figures}) + "\n")
     print(f"{folder.name}: trained", flush=True)
-    return dict(figures)
+    return figures
 
 
 def benchmark(options: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
@@ -165,7 +159,7 @@ def markdown(rows: Sequence[dict[str, Any]]) -> str:
                 cell(row["reliable_s"], 1),
                 cell(row["steps_per_s"], 0),
                 cell(row["steps"], 0),
-                cell(row["lap_s"], 2),
+                cell(row["lap_time_s"], 2),
                 iqm_text(row["lap_share"], percent),
             )
             for row in rows

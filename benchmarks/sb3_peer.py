@@ -15,7 +15,7 @@ there; a value network of features beside pictures is not. `--car-racing` trains
 import json
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -59,8 +59,13 @@ class Convolutions(BaseFeaturesExtractor):
         return features
 
 
-def build(experiment: Experiment, physics_threads: int, car_racing: bool = False) -> PPO:
-    """Return the peer with the experiment's hyperparameters."""
+def build(
+    experiment: Experiment,
+    physics_threads: int,
+    car_racing: bool = False,
+    learning_rate: Callable[[float], float] | None = None,
+) -> PPO:
+    """Return the peer with the experiment's hyperparameters; `learning_rate` None: it stays as it begins."""
     algorithm, network = experiment.algorithm, experiment.network
     assert isinstance(algorithm, PPOConfig)
     assert algorithm.frames_per_iteration is not None
@@ -84,7 +89,7 @@ def build(experiment: Experiment, physics_threads: int, car_racing: bool = False
     return PPO(
         policy,
         cars,
-        learning_rate=algorithm.lr,
+        learning_rate=learning_rate or algorithm.lr,
         n_steps=-(-algorithm.frames_per_iteration // n_cars),
         batch_size=algorithm.batch_size,
         n_epochs=algorithm.epochs,

@@ -29,10 +29,7 @@ medians over the rounds; a ratio is the median of the rounds' ratios.
 import ast
 import dataclasses
 import functools
-import json
 import statistics
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -56,7 +53,7 @@ from deepracer_exp.rewards.source import load_reward_source, source_with_constan
 from deepracer_exp.sim.batch import CarBatch, cores
 
 from .all_tracks import TRACKS
-from .command import read_metrics, train
+from .command import read_metrics, run_benchmark, train
 from .report import benchmark_parser, machine, number, table, write_json
 
 PASS_STEPS = 150
@@ -241,14 +238,12 @@ def training(overrides: Sequence[str], iterations: int, rounds: int, folder: Pat
         return last["env_steps"] - first["env_steps"], last["wall_clock_s"] - first["wall_clock_s"]
 
     def peer(physics_threads: int, torch_threads: int, car_racing: bool = False) -> tuple[float, float]:
-        command = [sys.executable, "-m", "benchmarks.sb3_peer", *overrides]
+        words = [*overrides]
         if car_racing:
-            command += [f"algorithm.frames_per_iteration={CAR_RACING_FRAMES}", "--car-racing"]
-        command += ["--iterations", "1" if car_racing else str(iterations)]
-        command += ["--physics-threads", str(physics_threads), "--torch-threads", str(torch_threads)]
-        root = Path(__file__).parents[1]
-        done = subprocess.run(command, cwd=root, check=True, stdout=subprocess.PIPE, text=True)
-        result = json.loads(done.stdout)
+            words += [f"algorithm.frames_per_iteration={CAR_RACING_FRAMES}", "--car-racing"]
+        words += ["--iterations", "1" if car_racing else str(iterations)]
+        words += ["--physics-threads", str(physics_threads), "--torch-threads", str(torch_threads)]
+        result = run_benchmark("sb3_peer", *words)
         return result["env_steps"], result["seconds"]
 
     passes: dict[str, Callable[[], tuple[float, float]]] = {"train": ours}
