@@ -51,7 +51,6 @@ def write_pictures(run_dir: Path, courses: Sequence[Course]) -> None:
     if trace is not None:
         figures[BEST_LAP] = driven_lines(trace, tracks, boxes_of)
     for name, figure in figures.items():
-        figure.set_dpi(120)
         # `savefig` draws a figure twice, the first time for its layout alone.
         FigureCanvasAgg(figure).print_png(run_dir / name)
 

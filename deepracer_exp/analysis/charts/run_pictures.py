@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -11,7 +12,6 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Polygon
 from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import NDArray
@@ -35,7 +35,7 @@ MANY = [*matplotlib.color_sequences["tab20"][::2], *matplotlib.color_sequences["
 """Colours of the tracks of a run."""
 _MARGIN_M = 0.25
 """Ground shown around the road."""
-_LAYOUT = ConstrainedLayoutEngine(w_pad=0.15, h_pad=0.12)
+_DPI = 120
 
 
 def episodes(trace: pd.DataFrame) -> pd.DataFrame:
@@ -94,6 +94,33 @@ def driven_lines(
     return lines_figure(shown)
 
 
+@dataclass(frozen=True)
+class _Margins:
+    """Room around axes in inches, as their words need it: a layout engine would take a third of the time of drawing."""
+
+    left: float
+    right: float
+    bottom: float
+    top: float
+    between_columns: float
+    between_rows: float
+
+    def subplots(self, figure: Figure, rows: int, columns: int, sharex: bool = False) -> NDArray[Any]:
+        """Return the axes of a grid, (rows, columns)."""
+        width, height = figure.get_size_inches()
+        axes_width = (width - self.left - self.right - (columns - 1) * self.between_columns) / columns
+        axes_height = (height - self.bottom - self.top - (rows - 1) * self.between_rows) / rows
+        place = {
+            "left": self.left / width,
+            "right": 1 - self.right / width,
+            "bottom": self.bottom / height,
+            "top": 1 - self.top / height,
+            "wspace": self.between_columns / axes_width,
+            "hspace": self.between_rows / axes_height,
+        }
+        return figure.subplots(rows, columns, squeeze=False, sharex=sharex, gridspec_kw=place)
+
+
 @dataclass(frozen=True, eq=False)
 class TrackLines:
     """Driven lines on a track."""
@@ -118,8 +145,10 @@ def lines_figure(shown: Sequence[TrackLines]) -> Figure:
         width_m, height_m = high - low
         shape = float(np.clip(height_m / width_m, 0.25, 0.9))
     cell = (10.0 if single else 13.0) / columns  # inches
-    figure = Figure((columns * cell, rows * (0.9 * shape * cell + 0.9)), dpi=150, layout=_LAYOUT)
-    cells = figure.subplots(rows, columns, squeeze=False)
+    figure = Figure((columns * cell, rows * (0.9 * shape * cell + 0.9)), dpi=_DPI)
+    title = 0.65 if single else 0.5  # inches
+    margins = _Margins(left=0.15, right=1.0, bottom=0.12, top=title, between_columns=0.3, between_rows=title)
+    cells = margins.subplots(figure, rows, columns)
     lines = []
     for axes, here in zip(cells.flat, shown, strict=False):
         _draw_road(axes, here.track)
@@ -140,7 +169,9 @@ def lines_figure(shown: Sequence[TrackLines]) -> Figure:
         for line in lines:
             # The few rows after the standing start would take half of the colours.
             line.set_clim(float(np.percentile(speeds, 5)), float(speeds.max()))
-        bar = figure.colorbar(lines[0], ax=cells, extend="min", shrink=0.6, aspect=30, panchor=False)
+        width, height = figure.get_size_inches()
+        place = figure.add_axes((1 - 0.6 / width, 0.2, 0.12 / width, 0.6 - 0.3 / height))
+        bar = figure.colorbar(lines[0], cax=place, extend="min")
         bar.outline.set_visible(False)
         bar.ax.tick_params(length=0, labelcolor=FAINT, labelsize=10)
         bar.ax.set_title("m/s", fontsize=10, color=FAINT, loc="left", pad=8)
@@ -156,8 +187,12 @@ def learning_curves(metrics: pd.DataFrame) -> Figure:
     With several tracks, completion and lap times have a thin line for each.
     """
     tracks = [name.removeprefix("completion/") for name in metrics if name.startswith("completion/")]
-    figure = Figure((10.0, 6.0 + 0.3 * math.ceil(len(tracks) / 5)), dpi=150, layout=_LAYOUT)
-    driving, returns, laps, entropy = figure.subplots(2, 2, sharex=True).flat
+    legend = 0.3 * math.ceil(len(tracks) / 5)  # inches
+    figure = Figure((10.0, 6.0 + legend), dpi=_DPI)
+    margins = _Margins(
+        left=0.6, right=0.15, bottom=0.55 + legend, top=0.37, between_columns=0.65, between_rows=0.65
+    )
+    driving, returns, laps, entropy = margins.subplots(figure, 2, 2, sharex=True).flat
     # A column of nulls alone has no numeric type.
     numbers = metrics.apply(pd.to_numeric).assign(lap_share=100 * metrics["lap_share"].astype(float))
     laps_label = "share of complete exploring laps" + (", on the track where it is lowest" if tracks else "")
@@ -185,7 +220,7 @@ def learning_curves(metrics: pd.DataFrame) -> Figure:
     if tracks:
         thin = driving.lines[: len(tracks)]
         style = {"ncols": 5, "frameon": False, "fontsize": 8, "labelcolor": INK}
-        figure.legend(thin, tracks, loc="outside lower center", **style)
+        figure.legend(thin, tracks, loc="lower center", **style)
     return figure
 
 
@@ -196,13 +231,15 @@ def _curves(
     curves: Mapping[str, tuple[str, str]],
     of_tracks: Sequence[str] = (),
 ) -> None:
-    axes.set_title(title, loc="left", fontsize=11, fontweight="bold", color=INK)
+    # With `y`, no space is looked for above what may stand there, which would take as long as drawing the ticks.
+    axes.set_title(title, loc="left", y=1.0, fontsize=11, fontweight="bold", color=INK)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color("#cdd2d8")
     axes.tick_params(length=0, labelcolor=FAINT, labelbottom=True)
     axes.grid(axis="y", color="#e9ecef", linewidth=0.8)
     axes.set_axisbelow(True)
     axes.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
+    axes.yaxis.set_major_formatter("{x:.5g}")
     thin = {name: ("", MANY[number % len(MANY)]) for number, name in enumerate(of_tracks)}
     for name, (label, color) in (thin | dict(curves)).items():
         # Not every iteration ends an episode on every track.
@@ -217,7 +254,7 @@ def _curves(
         axes.text(0.5, 0.5, "none yet", transform=axes.transAxes, ha="center", color=FAINT)
         axes.set_yticks([])
     elif any(label for label, _ in curves.values()) and axes.get_legend_handles_labels()[1]:
-        axes.legend(frameon=False, fontsize=9, labelcolor=INK)
+        axes.legend(frameon=False, fontsize=8, labelcolor=INK)
 
 
 def _result(episode: pd.Series) -> str:
