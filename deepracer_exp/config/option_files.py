@@ -27,13 +27,38 @@ from omegaconf.errors import OmegaConfBaseException
 from deepracer_exp.errors import BadInput, Unknown, nearest
 from deepracer_exp.files import read_yaml
 
-from .options import SWEEP, conf_dir, conf_dirs, find, groups, options, sweep_files
+from .options import (
+    DEEPEST,
+    SWEEP,
+    FileState,
+    conf_dir,
+    conf_dirs,
+    find,
+    groups,
+    option_files,
+    options,
+    sweep_files,
+)
 from .overrides import may_be_new, override_line
 from .track_options import BASE, world_values
 from .track_options import GROUP as TRACK
 
 _OPTION = "an option file with lines KEY: VALUE"
 _EMPTY = str(Path(__file__).parent)
+# Hydra's settings of its logs, folders and launchers, which have no effect here, were a fifth of the work.
+_NOT_HYDRAS_OWN = [
+    f"~hydra/{group}"
+    for group in (
+        "env",
+        "help",
+        "hydra_help",
+        "hydra_logging",
+        "job_logging",
+        "launcher",
+        "output",
+        "sweeper",
+    )
+]
 _PACKAGE = re.compile(r"(?:\s*#.*\n)*?\s*#\s*@package\s+(\S+)")
 
 # Lets option files refer to files beside them, whatever the working directory: ${conf:'reward/mine.py'}.
@@ -106,8 +131,9 @@ class OptionFiles(ConfigSource):
 
     @staticmethod
     def _is_below(config_path: str) -> bool:
-        # Names in `defaults:` of an option file must not lead out of the folder either.
-        return not Path(config_path).is_absolute() and ".." not in Path(config_path).parts
+        # Names in `defaults:` of an option file must not lead out of the folder either, nor deeper than `option_files`.
+        parts = Path(config_path).parts
+        return not Path(config_path).is_absolute() and ".." not in parts and len(parts) <= DEEPEST
 
 
 def _place(config_path: str) -> tuple[str, str]:
@@ -147,11 +173,24 @@ def composed(entry: str | None, lines: Sequence[str]) -> tuple[DictConfig, dict[
     Raises:
         BadInput: an option that another one names is not there, or a file cannot be used.
     """
+    config, choices = _composed(entry, tuple(lines), option_files())
+    return copy.deepcopy(config), dict(choices)
+
+
+@functools.lru_cache(maxsize=64)
+def _composed(
+    entry: str | None, lines: tuple[str, ...], files: tuple[FileState, ...]
+) -> tuple[DictConfig, dict[str, str]]:
+    """Compose as `composed` from these files.
+
+    The trials of a sweep choose the same options again and again, and every evaluation has the same two conditions: a
+    copy costs a tenth. A variable of the environment that a list of defaults names is read the first time.
+    """
     for plugin in (OptionFiles, OptionFolders):
         Plugins.instance().register(plugin)
     try:
         with initialize_config_dir(_EMPTY, version_base="1.3"):
-            config = compose(entry, overrides=list(lines), return_hydra_config=True)
+            config = compose(entry, overrides=[*lines, *_NOT_HYDRAS_OWN], return_hydra_config=True)
     except MissingConfigException as error:
         group, _, option = (error.missing_cfg_file or "").rpartition("/")
         hint = nearest(option, options(group)) if group in groups(entry or "train") else ""

@@ -17,6 +17,10 @@ SWEEP = "sweep"
 """The group whose options are the ready-made studies."""
 MOST_LISTED = 24
 """Most options that a message lists."""
+DEEPEST = 3
+"""Most parts of an option's path below `conf/`, as in `sweep/executor/local.yaml`."""
+FileState = tuple[str, int, int, int]
+"""Path of a file, times of its last changes (contents; contents or attributes) in nanoseconds, and size."""
 
 
 def project_dir(name: str) -> Path:
@@ -66,6 +70,27 @@ def sweep_files() -> dict[str, Path]:
             if namesake != path and read_bytes(path, "an option") != read_bytes(namesake, "an option"):
                 raise BadInput(path, f"{namesake} has the same name; rename the file")
     return files
+
+
+def option_files() -> tuple[FileState, ...]:
+    """Return all files of options, and those of studies, with what changes when they do.
+
+    Raises:
+        BadInput: as `conf_dirs`.
+    """
+    folders = [*conf_dirs(), project_dir("sweeps"), Path("sweeps").absolute()]
+    # A link to a folder is followed by `*`, which `**` would not do.
+    patterns = [f"{'*/' * depth}*.yaml" for depth in range(DEEPEST)]
+    files = {path for folder in folders for pattern in patterns for path in folder.glob(pattern)}
+    return tuple(_state(path) for path in sorted(files))
+
+
+def _state(path: Path) -> FileState:
+    try:
+        state = path.stat()
+    except OSError:  # a broken link; refused when it is read
+        return str(path), 0, 0, 0
+    return str(path), state.st_mtime_ns, state.st_ctime_ns, state.st_size
 
 
 def find(name: str) -> str:

@@ -24,6 +24,19 @@ def test_the_nearest_of_all_options_is_reported(own):
         compose_experiment(["budget=mine_al"])
 
 
+@pytest.mark.parametrize("is_link", [False, True])
+def test_an_option_is_composed_as_it_is_now(here, own, is_link):
+    (here / "elsewhere").mkdir()
+    (here / "conf").mkdir()
+    if is_link:
+        (here / "conf" / "budget").symlink_to(here / "elsewhere")
+    for steps in (2001, 3002, 3002):  # of the same length
+        own("budget/mine.yaml", f"defaults: [default, _self_]\nenv_steps: {steps}\n")
+        assert compose_experiment(["budget=mine"])[0].budget.env_steps == steps
+        assert compose_experiment(["budget=mine", "budget.env_steps=7"])[0].budget.env_steps == 7
+        assert compose_experiment(["budget=mine"])[0].budget.env_steps == steps
+
+
 def test_a_namesake_that_is_not_the_same_is_refused_whatever_is_chosen(own):
     path = own("budget/short.yaml", (conf_dir() / "budget/short.yaml").read_text())
     assert len(compose_experiment([])[0].name) > 0
