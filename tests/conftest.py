@@ -27,7 +27,6 @@ from deepracer_exp.cli import main
 from deepracer_exp.errors import BadInput
 
 from .browser import chromium, tab
-from .compositions import compose_once
 from .postgres import postgres, postgres_server
 from .waiting import PATIENCE_S
 
@@ -38,8 +37,6 @@ __all__ = ["chromium", "postgres", "postgres_server", "tab"]
 settings.register_profile("same", deadline=None, derandomize=True)
 settings.register_profile("new", deadline=None, print_blob=True)
 settings.load_profile("same")
-
-compose_once()
 
 # Where containers forbid it, every process would compile the tests and the package again: ten seconds of each worker.
 sys.dont_write_bytecode = False
@@ -57,14 +54,7 @@ REFERENCE = Path(__file__).parents[2] / "shared" / "reference"
 
 
 def pytest_collection_finish() -> None:
-    """Let trainings draw few pictures, and leave what is imported so far out of garbage collection.
-
-    The latter took a seventh of the time.
-    """
-    if "deepracer_exp.training.callbacks" in sys.modules:  # a test of something else need not import it
-        from .pictures import draw_each_kind_once
-
-        draw_each_kind_once()
+    """Leave what is imported so far out of garbage collection, which took a seventh of the time."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 20)
@@ -297,14 +287,10 @@ IN_PROCESS = ("experiment=tiny", "tracking=off", "collector=in_process", "collec
 IN_WORKERS = ("experiment=tiny", "tracking=off", "collector=sync", "collector.processes=2")
 
 
-def call_in(cwd: Path, *arguments: str, pictures: bool = False) -> Ended:
-    """Call `deepracer-exp ARGUMENTS` in this process with `cwd` as the working folder.
-
-    With `pictures`, a training draws its pictures even if those of such a run have been drawn before.
-    """
+def call_in(cwd: Path, *arguments: str) -> Ended:
+    """Call `deepracer-exp ARGUMENTS` in this process with `cwd` as the working folder."""
     out, err = io.StringIO(), io.StringIO()
     with (
-        _all_drawn() if pictures else contextlib.nullcontext(),
         contextlib.chdir(cwd),
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
@@ -312,12 +298,6 @@ def call_in(cwd: Path, *arguments: str, pictures: bool = False) -> Ended:
     ):
         main(arguments)
     return Ended(exit_.value.code or 0, out.getvalue(), err.getvalue(), cwd)
-
-
-def _all_drawn() -> contextlib.AbstractContextManager[None]:
-    from .pictures import all_drawn
-
-    return all_drawn()
 
 
 @pytest.fixture(scope="session")
@@ -357,9 +337,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Ended]:
     """Train the tiny experiment in this process, in a folder of its own; once for each set of overrides."""
 
     @functools.cache
-    def train(*overrides: str, pictures: bool = False) -> Ended:
-        folder = tmp_path_factory.mktemp("trained")
-        return call_in(folder, "train", *IN_PROCESS, *overrides, pictures=pictures)
+    def train(*overrides: str) -> Ended:
+        return call_in(tmp_path_factory.mktemp("trained"), "train", *IN_PROCESS, *overrides)
 
     return train
 

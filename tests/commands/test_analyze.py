@@ -173,7 +173,7 @@ def test_a_training_ends_with_its_page_which_stands_in_its_mlflow_run_too(call):
     from deepracer_exp.runs.files import read_run_id
 
     tiny = ("experiment=tiny", "collector=in_process", "collector.threads=1", "budget.iterations=1")
-    ended = call("train", *tiny, "report=true", pictures=True)
+    ended = call("train", *tiny, "report=true")
     assert ended.code == 0, ended.stderr
     assert "report.html" in ended.stdout
     line = r" analyze \S+ --open"

@@ -93,7 +93,7 @@ def test_another_word_is_refused_with_those_accepted():
     ("kept", "why"), [("off", "it was trained with trace=off"), ("laps", "trace=laps keeps complete laps")]
 )
 def test_every_reader_says_in_a_line_what_is_missing(trained, call, kept, why):
-    run = trained("budget.iterations=2", "report=true", f"trace={kept}", pictures=True)
+    run = trained("budget.iterations=2", "report=true", f"trace={kept}")
     assert run.code == 0, run.stderr
     assert f"no report.html, no best_lap.png: the run has no trace: {why}" in run.stderr + run.stdout
     assert (run.folder / "learning.png").is_file()

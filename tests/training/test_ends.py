@@ -125,7 +125,7 @@ def test_the_lines_to_paste_after_a_training_work(trained, copied, call):
 def test_a_run_has_pictures_as_soon_as_it_has_an_iteration(trained, tmp_path):
     write_pictures(tmp_path, build_courses(compose_experiment([])[0]))
     assert not list(tmp_path.iterdir())
-    folder = trained("budget.iterations=1", pictures=True).folder  # without a lap
+    folder = trained("budget.iterations=1").folder  # without a lap
     for name in ("best_lap.png", "learning.png"):
         assert (folder / name).read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
 

@@ -130,7 +130,7 @@ SEVERAL = (*OVERRIDES, f"track=[{','.join(TRACKS)}]", "track.Oval_track.directio
 
 
 def test_several_tracks_train_together_and_each_has_its_metrics(trained):
-    ended = trained(*SEVERAL, pictures=True)
+    ended = trained(*SEVERAL)
     assert ended.code == 0, ended.stderr
     assert_trace_gives_the_metrics(ended)
     trace = read_trace(ended.folder / "trace")
