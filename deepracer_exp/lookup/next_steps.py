@@ -13,6 +13,7 @@ from deepracer_exp.lookup.best import best_of
 from deepracer_exp.runs.files import (
     BEST,
     CHECKPOINTS,
+    LINEAGE,
     METRICS,
     RunRecord,
     full_name,
@@ -34,6 +35,10 @@ from deepracer_exp.runs.result import (
 from deepracer_exp.tracks.boards import standings, what_it_sees
 
 COMMAND = "deepracer-exp"
+SECOND_PHASE = "randomization=sim2real budget.env_steps=1000000"
+"""Overrides of the clone that makes a fast car a stable one."""
+FURTHER = "train it further, at a tenth of the learning rate"
+STABLE = "make it stable: train it further on changing conditions, at a tenth of the learning rate"
 _RUNS = Path("runs")
 """Where commands look for runs by themselves."""
 
@@ -118,7 +123,9 @@ def state(run: RunRecord) -> str:
 def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return commands for a run folder with its summary.json, each with what it does, the first to be used first."""
     word, name, config = run_word(run), own_word(run), read_config(run)
-    resume = command_line("resume", name, config)
+    resume, clone = command_line("resume", name, config), command_line("clone", word, config)
+    # A clone has had its second phase, and a policy for the physical car changing conditions of its own.
+    is_first = not (run / LINEAGE).exists() and not (config.get("randomization") or {}).get("real_car")
     steps = []
     if summary["iteration"]:
         evaluate = command_line("evaluate", word, config, OF_POLICY)
@@ -128,7 +135,7 @@ def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         steps += [
             (evaluate, "race the best checkpoint"),
             film,
-            (command_line("clone", word, config), "train it further, at a tenth of the learning rate"),
+            (f"{clone} {SECOND_PHASE}", STABLE) if is_first else (clone, FURTHER),
         ]
         best, fastest = ((run / CHECKPOINTS / label).resolve() for label in ("best", "fastest"))
         if fastest.is_dir() and fastest != best:
@@ -153,9 +160,7 @@ def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         if rule == "reliable" and not config["evaluation"].get("real_car"):
             return [(f"{resume} stopping=entropy", "train longer, until nothing improves any more"), *steps]
         if rule == "overfitting" and not is_randomized(config):
-            clone, _ = steps.pop()
-            what = "train it further on changing conditions, at a tenth of the learning rate"
-            return [(f"{clone} randomization=sim2real", what), *steps]
+            return [(f"{clone} {SECOND_PHASE}", STABLE), *steps[:-1]]
         steps.append((f"{resume} stopping=none", "continue it until its budget is used"))
     else:
         budget = {key: most for key, most in config["budget"].items() if key in spent and most is not None}

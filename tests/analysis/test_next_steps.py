@@ -57,7 +57,15 @@ def test_what_ended_a_run_decides_which_step_is_the_first(runs):
     }
     first = {rule: some[0][0] for rule, some in lines.items()}
     assert first["reliable"] == f"deepracer-exp resume {own_word(run)} stopping=entropy"
-    assert first["overfitting"] == f"deepracer-exp clone {run_word(run)} randomization=sim2real"
+    second_phase = f"deepracer-exp clone {run_word(run)} randomization=sim2real budget.env_steps=1000000"
+    assert first["overfitting"] == second_phase
+    assert second_phase in [line for line, _ in lines["converged"]]
+    # A clone has had its second phase.
+    (run / "lineage.json").write_text("{}")
+    steps = [line for line, _ in next_steps(run, {**summary, "rule": "converged"})]
+    assert f"deepracer-exp clone {run_word(run)}" in steps
+    assert second_phase not in steps
+    (run / "lineage.json").unlink()
     assert first["converged"] == f"deepracer-exp evaluate {run_word(run)}"
     assert [line.split()[1] for line, _ in lines["overfitting"]].count("clone") == 1
     # What is trained on changing conditions already is not advised to be.
