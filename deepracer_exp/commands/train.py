@@ -195,7 +195,9 @@ def _continue(plan: "ResumePlan | TrainPlan") -> int:
 
 
 _CLONE_EPILOG = """\
-  deepracer-exp clone RUN                                   from its best checkpoint
+  deepracer-exp clone RUN randomization=sim2real budget.env_steps=1000000
+                                                            the second phase, which makes a fast car a stable one
+  deepracer-exp clone RUN                                   from its best checkpoint, on the conditions of its parent
   deepracer-exp clone RUN checkpoint=last                   from a checkpoint other than the best
   deepracer-exp clone RUN algorithm.lr=1e-5                 a learning rate other than a tenth of the parent's
   deepracer-exp clone RUN reward=racing_line track=Oval_track
@@ -237,6 +239,7 @@ how
   sweep.storage=postgresql+psycopg://USER@HOST/NAME         instead of runs/sweeps.db
   sweep/executor=ray                                        workers on a Ray cluster (docs/scaling.md)
   parent=RUN                                                trials are clones of RUN
+  sweep.clone='{randomization: sim2real}'                   the best trial is cloned, and races its clone
 
   deepracer-exp sweep study=NAME                            resumes a study that was interrupted or killed
   deepracer-exp sweep study=NAME sweep.trials=120           makes more trials
@@ -245,7 +248,8 @@ how
   deepracer-exp clone best:NAME                             trains the winner further
   deepracer-exp sweep sweep=NAME --cfg                      prints the sweep and stops
 
-exit code: 0 all trials are done; 2 bad input; 3 all trials failed, or the database did not answer; 130, 143 interrupted
+exit code: 0 all trials are done; 2 bad input; 3 all trials or the clone failed, or the database did
+not answer; 130, 143 interrupted
 """
 _WORDS = ("report", "best")
 _WORKER = "deepracer_exp.sweeps.queue.worker"
@@ -267,7 +271,9 @@ def _sweep(args: argparse.Namespace) -> int:
         print(request.composition.yaml(), end="")
         return 0
     print_start()
-    start_workers_early(request.entry.sweep.executor.kind == "local", _WORKER)
+    # The clone drives with processes of this one.
+    forks = request.entry.sweep.executor.kind == "local" or request.entry.sweep.clone is not None
+    start_workers_early(forks, _WORKER)
 
     from deepracer_exp.sweeps import PAGE_FILE
     from deepracer_exp.sweeps.report.best import complete_trials
@@ -321,5 +327,22 @@ def _show_study(word: str, *arguments: str) -> int:
 
 def _print_best(study: "Study") -> None:
     from deepracer_exp.sweeps.report.best import best_line, best_shown, best_trial
+    from deepracer_exp.sweeps.report.last_race import last_race, race_rows
+    from deepracer_exp.sweeps.report.page import export_step, tried
 
+    if words := tried(study):
+        print(f"\n{words}")
     print(f"\nbest: trial {best_trial(study).number}, {best_shown(study)}\n\n  {best_line(study)}")
+    if (race := last_race(study)) is None:
+        return
+    first, (line, what) = race.racers[0], export_step(study)
+    print("\n" + " ".join(filter(None, (race.verdict(), race.doubt()))))
+    rows = race_rows(race)
+    width = max(len(row["name"]) for row in rows)
+    for row in rows:
+        held_out = f" usual, {row['held_out_laps']} held-out" * race.has_held_out
+        print(
+            f"  {row['name']:{width}}  mean usual lap {row['lap_time']}, laps complete: {row['laps']}{held_out}"
+        )
+    print(f"\n  run     best:{study.study_name}, which is {first.run}, checkpoint {first.checkpoint}")
+    print(f"  export  {line}  # {what}")

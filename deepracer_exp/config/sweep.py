@@ -25,7 +25,7 @@ from .dimension import Choices, as_override, dimension, override_value, plain_ex
 from .evaluation import EvaluationConfig
 from .experiment import SafeName
 from .options import groups
-from .overrides import PLAIN_TEXT, key_of, parse_sweep
+from .overrides import PLAIN_TEXT, key_of, override_line, parse_sweep
 from .own_class import REFERENCE
 from .parse import parse_config
 
@@ -40,6 +40,7 @@ _NOT_SEARCHED = {
     "runs_dir": "all runs of a study share one folder",
     "tracking": "all runs of a study are recorded in the same store",
 }
+_NOT_OF_A_CLONE = {"name", "runs_dir"}
 
 
 def _sampler(name: str) -> str:
@@ -79,6 +80,7 @@ class SweepConfig:
     objectives: Annotated[tuple[Objective, ...], Field(min_length=1)]
     rerank: Annotated[int, Field(ge=0, le=1000)]
     rerank_laps: Annotated[int, Field(ge=1, le=4096)]
+    clone: dict[str, Any] | None
     sampler: Annotated[str, AfterValidator(_sampler)]
     seed: Annotated[int, Field(ge=0, lt=2**31)]
     startup_trials: Natural
@@ -100,6 +102,13 @@ class SweepConfig:
             values = getattr(self, name)
             if len(set(values)) < len(values):
                 raise ValueError(f"{name}: {', '.join(values)}: one is listed twice")
+        for key in _NOT_OF_A_CLONE & {*(self.clone or ())}:
+            raise ValueError(f"clone: {key}: the clone is one of the study's runs")
+
+    @property
+    def clone_overrides(self) -> list[str]:
+        """Return the overrides of the clone of the best trial; none where there is no clone."""
+        return [override_line(key, value) for key, value in (self.clone or {}).items()]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -119,7 +119,8 @@ def _of_study(study: str, rows: Sequence[Row], best_run: str | None) -> Row:
         return row["run"] != f"{study}/{best_run}", math.inf if score_s is None else score_s
 
     trials = {row["trial"] for row in rows if row["trial"] is not None}
-    number = len(trials) + sum(row["trial"] is None for row in rows)
+    # A run says whose trial it is when it ends; one that has ended and is none is the clone of the best.
+    number = len(trials) + sum(row["study"] is None for row in rows)
     laps = [row["exploring_laps"] for row in rows if row["exploring_laps"] is not None]
     running = any(row["state"] == RUNNING for row in rows)
     return min(rows, key=rank) | {

@@ -2,6 +2,7 @@
 
 import collections
 import contextlib
+import copy
 import logging
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -18,14 +19,19 @@ from rich.console import Console
 from deepracer_exp.config import acting
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.overrides import group_of, key_of
+from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.config.running import MLflowTracking
+from deepracer_exp.config.stored import with_overrides
 from deepracer_exp.config.sweep import SweepConfig, SweepRequest
 from deepracer_exp.env.real_car import require_car
 from deepracer_exp.env.setup import build_setup
+from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.reward import RewardFunction
+from deepracer_exp.runs.lineage import refuse_other_networks
 from deepracer_exp.tracking.store import Store, resolve_store
 from deepracer_exp.tracking.study_run import Progress, StudyRun
 from deepracer_exp.tracking.tracking_file import Status
+from deepracer_exp.training.plan import TrainPlan, plan_training
 from deepracer_exp.training.signals import Interruption
 
 from . import PAGE_FILE
@@ -47,6 +53,7 @@ from .report.best import (
     complete_trials,
     write_best,
 )
+from .report.last_race import LAST_RACE, write_submitted
 from .report.view import SweepView
 from .search.pruners import build_pruner
 from .search.samplers import build_sampler
@@ -64,7 +71,7 @@ def sweep(plan: SweepPlan, console: Console) -> tuple[Study, Path, int]:
 
     Raises:
         BadInput: before anything is begun; nothing is left behind.
-        RunFailed: all trials fail, workers keep dying, or the database does not answer.
+        RunFailed: all trials fail, workers keep dying, the database does not answer, or the clone fails.
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     overrides, request = plan.overrides, _without_rules(plan.request, plan.overrides)
@@ -78,6 +85,7 @@ def sweep(plan: SweepPlan, console: Console) -> tuple[Study, Path, int]:
     settings = known_settings(request, space)
     example = plan_one(space.example())
     experiment = example.experiment
+    check_clone(example, config, request.stored)
     for note in (*request.composition.notes, *example.composition.notes) if request.stored else ():
         _log.warning(note)
     if parent and protocol.real_car is not None:
@@ -117,7 +125,7 @@ def sweep(plan: SweepPlan, console: Console) -> tuple[Study, Path, int]:
         status: Status = "FAILED"
         code = 0
         try:
-            code = _run(worker_config, storage, study, launcher, console, study_run)
+            code = _run(worker_config, storage, study, launcher, console, study_run, request.stored)
             status = "KILLED" if code else "FINISHED"
         except KeyboardInterrupt:  # the second one
             status, code = "KILLED", 130
@@ -125,6 +133,24 @@ def sweep(plan: SweepPlan, console: Console) -> tuple[Study, Path, int]:
             if study_run is not None:
                 study_run.finish(status, _INTERRUPTED_S if code else _DONE_S)
         return study, worker_config.folder, code
+
+
+def check_clone(trial: TrainPlan, config: SweepConfig, stored: bool) -> None:
+    """Refuse overrides with which a trial cannot be cloned; `stored` is as for `plan_trial`.
+
+    Raises:
+        BadInput: they name something unknown, give a value that is not accepted, or do not fit the trial's networks.
+    """
+    if config.clone is None:
+        return
+    try:
+        mapping = copy.deepcopy(trial.composition.mapping)
+        changed = with_overrides(mapping, {}, config.clone_overrides, stored=stored)
+        clone = parse_experiment(changed.mapping)
+        plan_training(clone, changed)
+        refuse_other_networks(trial.experiment, clone)
+    except BadInput as error:
+        raise BadInput("sweep.clone", error) from error
 
 
 def begin_study_run(
@@ -156,6 +182,7 @@ def _run(
     launcher: LocalLauncher | RayLauncher,
     console: Console,
     study_run: StudyRun | None,
+    stored: bool,
 ) -> int:
     """Run the workers, then derive everything else from the trial claims; return the exit code."""
     claims, patience_s = TrialClaims(storage.engine, worker_config.study), worker_config.config.patience_s
@@ -178,7 +205,7 @@ def _run(
                 return code
         patiently(partial(report_results, claims, storage), patience_s)
         try:
-            _conclude(worker_config, study, view, claims, interruption)
+            _conclude(worker_config, study, view, claims, interruption, stored)
         except Interrupted:
             assert interruption.exit_code is not None
             return interruption.exit_code
@@ -219,25 +246,29 @@ def _conclude(
     view: SweepView,
     claims: TrialClaims,
     interruption: Interruption,
+    stored: bool,
 ) -> None:
-    """Find the winner, and write best_of_sweep.json and the page."""
+    """Find the winner, and write best_of_sweep.json and the page; then the same with the clone, if there is one.
+
+    `stored`: whether the study holds the overrides of the clone; the user's own words otherwise.
+    """
     # Imported here: it takes seconds, and the workers start first.
     from .report.page import write_study_page
 
-    if complete_trials(study) and worker_config.config.rerank:
+    config, runs_dir, page = worker_config.config, worker_config.runs_dir, worker_config.folder / PAGE_FILE
+
+    def check(*_: object) -> None:
+        if interruption.signum is not None:
+            raise Interrupted
+
+    if complete_trials(study) and config.rerank:
         import torch
 
         torch.set_num_threads(1)
 
-        def check(*_: object) -> None:
-            if interruption.signum is not None:
-                raise Interrupted
-
         def show(trial: FrozenTrial) -> None:
             check()
-            view.show(
-                claims.all(), f"trial {trial.number} drives {worker_config.config.rerank_laps} fresh laps"
-            )
+            view.show(claims.all(), f"trial {trial.number} drives {config.rerank_laps} fresh laps")
 
         again = rerank(worker_config, study, show, check)
         study.set_user_attr("reranked_of", len(complete_trials(study)))
@@ -245,9 +276,17 @@ def _conclude(
         view.show(claims.all())
     else:
         study.set_user_attr("reranked", [])
+    study.set_user_attr(LAST_RACE, None)
     if complete_trials(study):
-        write_best(study, worker_config.runs_dir)
-    write_study_page(study, worker_config.folder / PAGE_FILE)
+        write_best(study, runs_dir)
+    write_study_page(study, page)
+    if complete_trials(study) and config.clone is not None:
+        from .last_stage import LastStage
+
+        look = partial(patiently, claims.all, config.patience_s)
+        race = LastStage(worker_config, study, stored, view, look, check).run()
+        write_submitted(study, runs_dir, race)
+        write_study_page(study, page)
 
 
 def _without_rules(request: SweepRequest, overrides: Sequence[str]) -> SweepRequest:

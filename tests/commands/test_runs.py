@@ -81,6 +81,19 @@ def test_the_trials_of_a_study_are_one_line_with_its_best_run(call, tmp_path):
     best = {"study": "season", "trial": 0, "run_dir": names[0], "values": {"race_score": 9.1}}
     (tmp_path / "runs" / "season" / "best_of_sweep.json").write_text(json.dumps(best))
     assert call("runs").stdout.splitlines()[1].split()[4:7] == ["ended", "7.00", "9.00"]
+    # The clone of the best trial is a run of the study and no trial.
+    clone = tmp_path / "runs" / "season" / f"{stamp(600)}-clone1"
+    write_run(clone, {"status": "finished", "study": "season", "laps": 1, "best": {"eval_lap_time_s": 6.5}})
+    best_of_sweep = tmp_path / "runs" / "season" / "best_of_sweep.json"
+    best_of_sweep.write_text(json.dumps(best | {"run_dir": clone.name}))
+    assert call("runs").stdout.splitlines()[1].split()[:6] == [
+        "best:season,",
+        "of",
+        "3",
+        "trials",
+        "ended",
+        "6.50",
+    ]
 
 
 @pytest.mark.parametrize(

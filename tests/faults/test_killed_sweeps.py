@@ -214,6 +214,42 @@ def test_a_worker_that_wakes_up_after_its_lease_writes_neither_into_the_study_no
     assert not (Path(held.trial.runs[0].run_dir) / "summary.json").exists()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", TIMES)
+@pytest.mark.parametrize("is_killed", [True, False])
+def test_a_sweep_that_ends_in_its_last_stage_resumes_the_clone_and_no_trial(
+    sweep, start, tmp_path, is_killed, seed
+):
+    """The clone has each of its iterations once, in one folder, whether the sweep was killed or got a Ctrl-C."""
+    iterations, runs = 60, tmp_path / "runs" / "s"
+    clone = f"sweep.clone={{randomization: sim2real, budget.iterations: {iterations}}}"
+    running = sweep("sweep.workers=2", "sweep.rerank_laps=2", clone)
+    rows = 1 + random.Random(seed).randrange(iterations // 2)
+    running.wait_for(
+        lambda: sum(file.read_bytes().count(b"\n") for file in runs.glob("*-clone1/metrics.jsonl")) >= rows,
+        f"{rows} rows of the clone",
+    )
+    ended_s = {path: path.stat().st_mtime_ns for path in runs.glob("*/summary.json")}
+    assert len(ended_s) == TRIALS
+    if is_killed:
+        running.driver.kill()
+        running.command.popen.wait()
+    else:
+        interrupted(running)
+        (summary,) = runs.glob("*-clone1/summary.json")
+        assert read_object(summary)["status"] == "interrupted"
+    # The command that the interrupted sweep has printed: the study remembers the clone.
+    again = start("sweep", "study=s").end()
+    assert again.code == 0, again.stderr
+    assert "resumes after iteration" in (next(runs.glob("*-clone1")) / "log.txt").read_text()
+    assert "Submit " in again.stdout
+    assert_every_trial_is_accounted_for_once(tmp_path)
+    assert {path: path.stat().st_mtime_ns for path in ended_s} == ended_s
+    (folder,) = runs.glob("*-clone1")
+    assert read_object(folder / "summary.json")["status"] == "finished"
+    assert [row["iteration"] for row in read_metrics(folder / "metrics.jsonl")] == [*range(1, iterations + 1)]
+
+
 def is_locked(cwd):
     with contextlib.closing(sqlite3.connect(cwd / "runs" / "sweeps.db", timeout=2.0)) as study:
         try:

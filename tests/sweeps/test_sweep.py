@@ -105,13 +105,13 @@ def test_drivers_that_begin_at_once_share_one_run_in_mlflow(tmp_path):
 def test_ctrl_c_ends_the_re_ranking_between_two_trials(tmp_path):
     study = new_study(tmp_path)
     add(study, [9.0])
-    config = SimpleNamespace(rerank=1, rerank_laps=60, objectives=("race_score",))
+    config = SimpleNamespace(rerank=1, rerank_laps=60, clone=None, objectives=("race_score",))
     protocol = compose_evaluation(["evaluation=sweep"])[0].evaluation
     worker_config = SimpleNamespace(config=config, protocol=protocol, folder=tmp_path, runs_dir=tmp_path)
     interruption = Interruption()
     interruption.signum = signal.SIGINT
     with pytest.raises(Interrupted):
-        _conclude(worker_config, study, SimpleNamespace(), SimpleNamespace(), interruption)
+        _conclude(worker_config, study, SimpleNamespace(), SimpleNamespace(), interruption, False)
     assert "reranked" not in study.user_attrs
 
 

@@ -38,6 +38,12 @@ def load(cwd, name):
         (("observation=camera,camera_small", "sweep.protocol=real_car"), ("observation=camera", "160x120")),
         ((LR, "randomization=real_car"), ("randomization.real_car", "the car has no features of the road")),
         ((LR, "seed=0,1"), ("sweep.seeds",)),
+        (
+            (LR, "sweep.clone={randomization: sim2reel}"),
+            ("sweep.clone: randomization=", "did you mean sim2real?"),
+        ),
+        ((LR, "sweep.clone={network: mlp}"), ("sweep.clone: network: cannot be changed in a clone",)),
+        ((LR, "sweep.clone={name: other}"), ("sweep: clone: name",)),
         ((LR, "parent=no_such_run"), ("parent=no_such_run",)),
         ((LR, "--storage", "sqlite:///x.db"), ("unrecognized arguments: --storage",)),
         ((LR, "sweep.storage=sqlite:////proc/x.db"), ("sweep.storage=", "/proc/x.db cannot be written")),

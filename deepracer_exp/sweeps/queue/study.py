@@ -32,9 +32,12 @@ _log = logging.getLogger("deepracer_exp")
 
 MAY_DIFFER = (
     *("study", "debug", "sweep/executor", "sweep.trials", "sweep.workers", "sweep.storage", "sweep.lease_s"),
-    *("sweep.patience_s", "sweep.rerank", "sweep.rerank_laps", "sweep.enqueue", "runs_dir"),
+    *("sweep.patience_s", "sweep.rerank", "sweep.rerank_laps", "sweep.clone", "sweep.enqueue"),
+    "runs_dir",
 )
 """Keys that do not change the trials themselves."""
+_OF_LAST_START = ("trials", "clone")
+"""Settings that a study is resumed with as its last start had them: they may have been given since it was begun."""
 _SAME = ("objectives", "seeds", "protocol", "parent")
 """Attributes that comparable trials share, beside space and base."""
 
@@ -80,7 +83,7 @@ def with_stored(
     Raises:
         BadInput: an override is not accepted, there is nothing to search, or there is no study of that name to resume.
     """
-    from deepracer_exp.config.overrides import key_of
+    from deepracer_exp.config.overrides import key_of, override_line
     from deepracer_exp.config.sweep import compose_sweep
 
     names_only = not set(map(key_of, overrides)) - {*MAY_DIFFER}
@@ -88,9 +91,9 @@ def with_stored(
     if study is None:
         return overrides, request, None
     if names_only:
-        # The total of the last start: it may have been raised since the study was begun.
-        total = [f"sweep.trials={study.user_attrs['trials']}"] if "trials" in study.user_attrs else []
-        overrides = [*study.user_attrs.get("overrides", ()), *total, *overrides]
+        stored = study.user_attrs
+        last = [override_line(f"sweep.{key}", stored[key]) for key in _OF_LAST_START if key in stored]
+        overrides = [*stored.get("overrides", ()), *last, *overrides]
         request = compose_sweep(overrides, stored=True)
     if not request.space:
         raise BadInput(
@@ -166,7 +169,8 @@ def open_study(
                 f"study={name}: exists with another search: {'; '.join(differences)}; give another name, or "
                 f"resume it with `deepracer-exp sweep study={name}` alone"
             )
-    study.set_user_attr("trials", sweep.trials)
+    for key in _OF_LAST_START:
+        study.set_user_attr(key, getattr(sweep, key))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ExperimentalWarning)
         # Optuna Dashboard calls them "Objective 0" otherwise.

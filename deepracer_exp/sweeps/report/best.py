@@ -99,7 +99,16 @@ def best_run(study: optuna.Study, runs_dir: Path | None = None) -> Path:
     Raises:
         BadInput: no trial is complete, or the folder is neither where it was nor in `runs_dir`.
     """
-    trial, objectives = best_trial(study), objectives_of(study)
+    return run_of(study, best_trial(study), runs_dir)
+
+
+def run_of(study: optuna.Study, trial: FrozenTrial, runs_dir: Path | None = None) -> Path:
+    """Return the folder of the best run of a complete trial, over all seeds; `runs_dir`: where the study says.
+
+    Raises:
+        BadInput: the folder is neither where it was nor in `runs_dir`.
+    """
+    objectives = objectives_of(study)
     runs = [run for run in Trial.of(trial).runs if run.values]
     best = min(runs, key=lambda run: cost(objectives, run.values or ()), default=SeedRun(seed=0))
     base = runs_dir or Path(study.user_attrs.get("runs_dir", "runs"))

@@ -60,6 +60,27 @@ def usual_range(values: Sequence[float], minimize: bool) -> tuple[float, float]:
     return low, high
 
 
+def importances(study: optuna.Study) -> dict[str, float]:
+    """Return by the searched keys how much each mattered for the first objective, shares of 1, the largest first.
+
+    Empty where too few trials are complete, or one key is searched.
+    """
+    complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    if len(complete) < FEWEST_COMPLETE or len({key for trial in complete for key in trial.params}) < 2:
+        return {}
+    objectives = objectives_of(study)
+    sign = 1.0 if MEASURES[objectives[0]].minimize else -1.0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        return optuna.importance.get_param_importances(
+            study, evaluator=_evaluator(), target=None if len(objectives) == 1 else _value(0, sign)
+        )
+
+
+def _evaluator() -> optuna.importance.PedAnovaImportanceEvaluator:
+    return optuna.importance.PedAnovaImportanceEvaluator(target_quantile=_BEST_SHARE)
+
+
 def _drawn(study: optuna.Study) -> "Iterator[tuple[str, str, go.Figure]]":
     # It imports scikit-learn and plotly, which take seconds.
     from optuna import visualization
@@ -84,13 +105,12 @@ def _drawn(study: optuna.Study) -> "Iterator[tuple[str, str, go.Figure]]":
             history.update_yaxes(range=ranges[index], title=None),
         )
         if len(complete) >= FEWEST_COMPLETE and len(parameters) > 1:
-            evaluator = optuna.importance.PedAnovaImportanceEvaluator(target_quantile=_BEST_SHARE)
             cost = None if is_one else _value(index, 1.0 if MEASURES[objective].minimize else -1.0)
             yield (
                 f"importance{suffix}",
                 f"Which parameters mattered most: {words}",
                 visualization.plot_param_importances(
-                    study, evaluator=evaluator, target=cost, target_name=words
+                    study, evaluator=_evaluator(), target=cost, target_name=words
                 ).update_yaxes(title=None),
             )
         if parameters:

@@ -13,10 +13,10 @@ from deepracer_exp.config.overrides import key_of
 from deepracer_exp.config.own_class import OF_POLICY
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.files import atomic_write, read_bytes
-from deepracer_exp.lookup.next_steps import COMMAND, command_line
+from deepracer_exp.lookup.next_steps import COMMAND, FURTHER, SECOND_PHASE, STABLE, command_line
 from deepracer_exp.lookup.next_steps import outcome as run_outcome
 from deepracer_exp.reports.page import plot, render
-from deepracer_exp.runs.files import BEST_LAP, read_config, read_head
+from deepracer_exp.runs.files import BEST_LAP, read_config, read_head, sees_pictures
 from deepracer_exp.runs.result import FRESH_LAPS, SWEEP_LAPS, TRAINING_LAPS, of_conditions
 from deepracer_exp.sweeps.search.objectives import (
     MEASURES,
@@ -28,13 +28,16 @@ from deepracer_exp.sweeps.search.objectives import (
 from deepracer_exp.sweeps.trial import Trial
 
 from .best import best_line, best_run, best_shown, best_trial, complete_trials, over_seeds, reranked
-from .figures import FEWEST_COMPLETE, figures, least_width, narrowed
+from .figures import FEWEST_COMPLETE, figures, importances, least_width, narrowed
 from .labels import ENDINGS, duration, ending_of, ending_words, parameter, short_keys, steps
+from .last_race import last_race, race_rows
 
 _MOST_ROWS = 300
 _MOST_FAILURES = 20
 _MOST_PARAMETERS = 12
 _LONGEST_REASON = 140
+_MOST_NAMED, _LEAST_SHARE = 3, 0.1
+"""Parameters of which words say that they mattered most, and the least share of the importance that they have."""
 _LONGEST_TRACEBACK = 4000
 _ORDER = (TrialState.COMPLETE, TrialState.RUNNING, TrialState.PRUNED, TrialState.FAIL, TrialState.WAITING)
 
@@ -64,9 +67,13 @@ def study_page(study: optuna.Study) -> str:
         plots,
         study=study.study_name,
         headline=study_summary(study),
+        tried=tried(study),
         endings=endings(trials),
         winner=_winner(study, keys) if complete else [],
         steps=_next_steps(study) if complete else [(_resume(study), "continue the search")],
+        race=last_race(study),
+        submit=None if last_race(study) is None else export_step(study),
+        racers=race_rows(last_race(study)),
         picture=_picture(study) if complete else None,
         best=best_trial(study).number if complete else None,
         winners=_winners(study, objectives, keys),
@@ -89,7 +96,9 @@ def study_summary(study: optuna.Study) -> list[str]:
     ended = [trial for trial in trials if trial.state.is_finished()]
     complete = [trial for trial in ended if trial.state == TrialState.COMPLETE]
     total = study.user_attrs.get("trials", len(trials))
-    sentences = []
+    sentences: list[str] = []
+    if (race := last_race(study)) is not None:
+        sentences += filter(None, (race.verdict(), race.doubt()))
     if complete:
         best = best_trial(study)
         sentences.append(f"Trial {best.number} is the best: {best_shown(study)}.")
@@ -106,6 +115,17 @@ def study_summary(study: optuna.Study) -> list[str]:
         f"{len(ended)} of {count(total, 'trial')} ended, {len(complete)} of them complete; they drove {steps(spent)} "
         f"control steps{share}.",
     ]
+
+
+def tried(study: optuna.Study) -> str:
+    """Return what the trials differed in, and what of it mattered most, in words."""
+    keys = short_keys(sorted({key for trial in study.get_trials(deepcopy=False) for key in trial.params}))
+    if not keys:
+        return ""
+    words = f"Tried: {', '.join(keys.values())}."
+    mattered = [(key, share) for key, share in importances(study).items() if share >= _LEAST_SHARE]
+    shown_shares = ", ".join(f"{keys[key]} ({share:.0%})" for key, share in mattered[:_MOST_NAMED])
+    return f"{words} What mattered most: {shown_shares}." if mattered else words
 
 
 def _winner(study: optuna.Study, keys: dict[str, str]) -> list[tuple[str, str]]:
@@ -139,12 +159,33 @@ def _next_steps(study: optuna.Study) -> list[tuple[str, str]]:
     clone = command_line("clone", winner, config)
     where = "".join(f" {shlex.quote(word)}" for word in _where(study))
     more = 2 * int(study.user_attrs.get("trials", len(study.trials)))
-    return [
-        (best_line(study), "train the winner again"),
-        (f"{evaluate}{where} --video lap.mp4", "race it, and film its fastest usual lap"),
-        (f"{clone}{where}", "train it further, at a tenth of the learning rate"),
-        (f"{_resume(study)} sweep.trials={more}", "continue the search, with twice the trials"),
-    ]
+    race_it = (f"{evaluate}{where} --video lap.mp4", "race it, and film its fastest usual lap")
+    further = (f"{_resume(study)} sweep.trials={more}", "continue the search, with twice the trials")
+    if last_race(study) is None:
+        again = (best_line(study), "train the winner again")
+        return [again, race_it, (f"{clone}{where} {SECOND_PHASE}", STABLE), further]
+    again = (best_line(study), f"train trial {best_trial(study).number} again")
+    return [export_step(study), race_it, (f"{clone}{where}", FURTHER), again, further]
+
+
+def export_step(study: optuna.Study) -> tuple[str, str]:
+    """Return the command that exports the run to submit, with what it writes.
+
+    Features of the road are known to this simulator alone: of a policy that sees them the service takes the files with
+    which to train there, and no weights.
+    """
+    race = last_race(study)
+    assert race is not None
+    try:
+        config = read_config(best_run(study).with_name(race.racers[0].run))
+    except BadInput:  # moved or removed since
+        config = {}
+    line = command_line("export", f"best:{study.study_name}", config, OF_POLICY)
+    wanted, what = "aws", "its reward function, actions and hyperparameters, for the console"
+    if sees_pictures(config):
+        wanted, what = "aws-model", "its model, for the console"
+    where = "".join(f" {shlex.quote(word)}" for word in _where(study))
+    return f"{line} format={wanted}{where}", f"write {what}"
 
 
 def _resume(study: optuna.Study) -> str:

@@ -51,7 +51,7 @@ class SweepView:
             self._live.start()
         else:
             trials, workers = count(self._sweep.trials, "trial"), count(self._workers, "worker")
-            self._line(f"{self._study}: {trials}, {workers}; runs in {self._folder}")
+            self.say(f"{self._study}: {trials}, {workers}; runs in {self._folder}")
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -67,12 +67,13 @@ class SweepView:
             self._follow(claim)
             if self._live is None and claim.trial.number in ended - self._printed:
                 line = _sentence(claim, self._sweep.objectives)
-                self._line(f"{line}; {len(ended)} of {self._sweep.trials}, {self._left(claims)}")
+                self.say(f"{line}; {len(ended)} of {self._sweep.trials}, {self._left(claims)}")
         self._printed |= ended
         if self._live is not None:
             self._live.update(self._panel(claims, stage), refresh=True)
 
-    def _line(self, text: str) -> None:
+    def say(self, text: str) -> None:
+        """Print a line, above the panel where there is one."""
         self._console.print(text, soft_wrap=True)
 
     def _follow(self, claim: Claim) -> None:
