@@ -10,6 +10,7 @@ from scipy.spatial.distance import cdist
 
 from deepracer_exp.aws.logs.recording import Recording
 from deepracer_exp.aws.models.model_metadata import Action
+from deepracer_exp.config.bounds import FEWEST_ACTIONS, MOST_ACTIONS
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.fastest.lap import FastestLap
@@ -29,8 +30,6 @@ CORRECTION = 1 / 3
 """Share of full lock that brings a car back to its line at the laps' own speed."""
 NEAR = 0.5
 """Distance from a chosen action, m/s or as much steering, up to which one to recover with is not added."""
-FEWEST, MOST = 6, 100
-"""Actions that can be asked for: at most five are added to recover with."""
 STEERING_STEP_DEG, SPEED_STEP_MPS = 0.5, 0.05
 """Proposed actions are rounded to multiples of these."""
 _LOWEST = 1.0
@@ -152,14 +151,14 @@ def check_count(wanted: int) -> None:
     Raises:
         BadInput: too few or too many.
     """
-    if not FEWEST <= wanted <= MOST:
-        raise BadInput(f"--count {wanted}", "", f"{FEWEST} to {MOST}")
+    if not FEWEST_ACTIONS <= wanted <= MOST_ACTIONS:
+        raise BadInput(f"--count {wanted}", "", f"{FEWEST_ACTIONS} to {MOST_ACTIONS}")
 
 
 def propose_actions(commands: Commands, wanted: int, car: CarConfig) -> ActionProposal:
     """Choose the actions nearest to the commands of fast laps, and what a policy needs to recover.
 
-    `wanted` is a number of `FEWEST` to `MOST` actions.
+    `wanted` is a number of actions that `check_count` accepts.
 
     Actions are the centres of clusters (k-means) of the commands, in steering and speed weighted by `DEGREES_PER_MPS`.
     Laps that went well do not show how to come back to the line, and a policy has to learn that first. So these are

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from deepracer_exp.errors import BadInput, writing
 
 from .arguments import Stores, add_command, add_run, complete_runs, read_stores, runs_and_overrides
-from .output import table_console, warnings_on_stderr
+from .output import print_notes, table_console, warnings_on_stderr
 from .pages import existing_logs
 from .tracks import ROUTES, experiment_on, search_fastest
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from deepracer_exp.analysis.proposed_actions import ActionProposal, Commands
     from deepracer_exp.aws.models.model_metadata import ModelMetadata
     from deepracer_exp.config.car import CarConfig
+    from deepracer_exp.sweeps.plan import LapActions
 
 _EPILOG = """\
   deepracer-exp actions RUN                                 from the fast laps of its best checkpoint, driven now
@@ -126,6 +127,31 @@ def _actions(args: argparse.Namespace) -> int:
     print(f"\n  option    {option}\n  metadata  {folder / METADATA}\n  picture   {folder / PICTURE}")
     print(f"\n  train with it  deepracer-exp train action_space={name}")
     return 0
+
+
+def write_lap_actions(wanted: "LapActions") -> None:
+    """Write the lists of actions that are no option yet, from the fastest lap of the car on the track.
+
+    Raises:
+        BadInput: a file cannot be written.
+        RunFailed: no lap is possible.
+    """
+    from deepracer_exp.analysis.proposed_actions import commands_of_fastest, propose_actions
+    from deepracer_exp.config.imported_options import check_action_space_name, write_action_space
+    from deepracer_exp.config.options import options
+
+    missing = {name: count for name, count in wanted.counts.items() if name not in options("action_space")}
+    for name in missing:
+        check_action_space_name(name)
+    if not missing:
+        return
+    experiment, course = experiment_on([*wanted.overrides, *FREE])
+    lap = search_fastest(experiment, course)
+    commands = commands_of_fastest(lap, experiment.car.name, course.name).within(experiment.car)
+    for name, count in missing.items():
+        actions = propose_actions(commands, count, experiment.car).actions
+        path = write_action_space(name, actions, f"{len(actions)} actions from {commands.laps}.")
+        print_notes([f"action_space={name}: {len(actions)} actions from {commands.laps}; {path}"])
 
 
 def _check_folder(output: str) -> Path:

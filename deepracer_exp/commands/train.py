@@ -223,11 +223,14 @@ def _clone(args: argparse.Namespace) -> int:
 
 
 _SWEEP_EPILOG = """\
+a season in one command: rewards, actions and recipes, a second phase, and a page that says what to submit
+  deepracer-exp sweep sweep=season track=Oval_track
+
 what to search, in Hydra's grammar
   deepracer-exp sweep algorithm.lr='tag(log,interval(1e-5,1e-3))' network=mlp_small,mlp
-  deepracer-exp sweep sweep=lr_entropy track=Oval_track     a ready-made study: lr_entropy, reward_weights,
-                                                            action_space, network, everything, or
-                                                            NAME of ./sweeps/NAME.yaml
+  deepracer-exp sweep sweep=lr_entropy track=Oval_track     a ready-made study: season, lr_entropy,
+                                                            reward_weights, action_space, network, everything,
+                                                            or NAME of ./sweeps/NAME.yaml
   KEY='interval(LOW,HIGH)'  'tag(log,interval(LOW,HIGH))'  'int(interval(LOW,HIGH))'  A,B  'range(FROM,BELOW,STEP)'
   GROUP='glob(*)'                                           all options of a group
 
@@ -274,6 +277,10 @@ def _sweep(args: argparse.Namespace) -> int:
     # The clone drives with processes of this one.
     forks = request.entry.sweep.executor.kind == "local" or request.entry.sweep.clone is not None
     start_workers_early(forks, _WORKER)
+    if plan.lap_actions is not None:
+        from .actions import write_lap_actions
+
+        write_lap_actions(plan.lap_actions)
 
     from deepracer_exp.sweeps import PAGE_FILE
     from deepracer_exp.sweeps.report.best import complete_trials

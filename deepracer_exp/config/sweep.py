@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field
 
 from deepracer_exp.errors import BadInput
 
-from .bounds import Count, Natural, Seconds, UpTo100, UpTo1000
+from .bounds import ActionCount, Count, Natural, Seconds, UpTo100, UpTo1000
 from .compose import (
     Composition,
     check_choice,
@@ -93,15 +93,16 @@ class SweepConfig:
     storage: Annotated[str, Field(min_length=1)] | None
     enqueue: tuple[dict[str, Any] | str, ...]
     executor: ExecutorConfig
+    lap_actions: tuple[ActionCount, ...]
     train: tuple[str, ...]
     space: dict[str, str]
 
     def __post_init__(self) -> None:
         """Refuse names that are listed twice."""
-        for name in ("objectives", "pruners"):
+        for name in ("objectives", "pruners", "lap_actions"):
             values = getattr(self, name)
             if len(set(values)) < len(values):
-                raise ValueError(f"{name}: {', '.join(values)}: one is listed twice")
+                raise ValueError(f"{name}: {', '.join(map(str, values))}: one is listed twice")
         for key in _NOT_OF_A_CLONE & {*(self.clone or ())}:
             raise ValueError(f"clone: {key}: the clone is one of the study's runs")
 

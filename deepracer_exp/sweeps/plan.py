@@ -1,18 +1,36 @@
 """What a sweep was asked, with the answers: request, study, files; nothing here imports PyTorch."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deepracer_exp.config import custom_files
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.dimension import Choices, dimension
 from deepracer_exp.config.options import groups
-from deepracer_exp.config.overrides import key_of
+from deepracer_exp.config.overrides import group_of, key_of
 from deepracer_exp.config.sweep import SweepRequest, compose_sweep
+from deepracer_exp.errors import BadInput
 from deepracer_exp.training.plan import plan_training
 
 if TYPE_CHECKING:
     from optuna.study import Study
+
+_ACTIONS = "action_space"
+_USUAL = ("deepracer", "forward")
+"""The car and the direction that the name of a list leaves out."""
+
+
+@dataclass(frozen=True)
+class LapActions:
+    """Lists of actions from the fastest lap of a car on a track (`sweep.lap_actions`)."""
+
+    overrides: tuple[str, ...]
+    """The overrides that choose the car and the track."""
+    counts: Mapping[str, int]
+    """The number of actions by the name of the option, as which `deepracer-exp actions` writes a list."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +42,8 @@ class SweepPlan:
     """Overrides of the request: what the study was begun with comes before what only names it."""
     study: "Study | None"
     """The study that is continued; None: it is begun."""
+    lap_actions: LapActions | None
+    """Lists of actions of `request` that may have to be made; None: it has none."""
     remarks: tuple[str, ...]
     """A line for each thing about the action space that a racer may not have meant."""
 
@@ -47,4 +67,34 @@ def plan_sweep(overrides: Sequence[str], *, is_only_shown: bool = False) -> Swee
         overrides, request, study = with_stored(request, overrides)
     if not is_only_shown:
         request.refuse_empty()
-    return SweepPlan(request, overrides, study, remarks)
+    request, lap_actions = _with_lap_actions(request)
+    return SweepPlan(request, overrides, study, lap_actions, remarks)
+
+
+def _with_lap_actions(request: SweepRequest) -> tuple[SweepRequest, LapActions | None]:
+    """Let the lists of actions from a lap compete where a ready-made search over `action_space` is as it was.
+
+    Raises:
+        BadInput: there is no single track, or no single car.
+    """
+    sweep, searched = request.entry.sweep, request.space.get(_ACTIONS)
+    if not sweep.lap_actions or searched is None or searched != sweep.space.get(_ACTIONS):
+        return request, None
+    what = f"sweep.lap_actions={[*sweep.lap_actions]}"
+    if several := {"track", "car", "experiment"} & set(map(group_of, request.space)):
+        raise BadInput(what, f"{min(several)} is searched", "one track and one car, or sweep.lap_actions=[]")
+    lines = [
+        line for line in request.base if group_of(line) in ("track", "car", "experiment", custom_files.KEY)
+    ]
+    experiment, composition = compose_experiment(lines, stored=request.stored)
+    if len(experiment.tracks) > 1:
+        raise BadInput(what, f"{len(experiment.tracks)} tracks", "one track, or sweep.lap_actions=[]")
+    ((_, track),) = experiment.tracks.items()
+    parts = [track.name if track.file is None else Path(track.file).stem, composition.choices["car"]]
+    parts = [part for part in (*parts, track.direction) if part not in _USUAL]
+    place = re.sub(r"[^A-Za-z0-9_]+", "-", "-".join(parts))
+    counts = {f"lap{number}-{place}": number for number in sweep.lap_actions}
+    options = dimension(_ACTIONS, searched)
+    assert isinstance(options, Choices)
+    both = ",".join(map(str, dict.fromkeys((*options.values, *counts))))
+    return replace(request, space={**request.space, _ACTIONS: both}), LapActions(tuple(lines), counts)

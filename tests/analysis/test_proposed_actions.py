@@ -9,13 +9,13 @@ from scipy.spatial.distance import cdist
 from deepracer_exp.analysis.charts.proposed_actions import proposed_actions_picture
 from deepracer_exp.analysis.proposed_actions import (
     DEGREES_PER_MPS,
-    FEWEST,
     NEAR,
     Commands,
     commands_of_log,
     fast_laps,
     propose_actions,
 )
+from deepracer_exp.config.bounds import FEWEST_ACTIONS
 from deepracer_exp.config.compose import compose_experiment
 from tests.conftest import refused
 
@@ -96,7 +96,7 @@ def test_a_list_that_suffices_is_kept_as_it_is(car):
 
 @given(
     st.lists(st.tuples(st.floats(-45, 45), st.floats(0, 5)), min_size=1, max_size=60),
-    st.integers(FEWEST, 20),
+    st.integers(FEWEST_ACTIONS, 20),
 )
 def test_whatever_the_laps_command_the_car_can_turn_brake_and_correct(car, points, wanted):
     driven = commands(*np.array(points).T).within(car)
@@ -125,7 +125,7 @@ def test_laps_that_turn_left_only_leave_a_way_to_the_right(car):
     assert proposed_actions_picture("left", proposal).startswith(b"\x89PNG")
 
 
-@pytest.mark.parametrize("wanted", [FEWEST - 1, 101])
+@pytest.mark.parametrize("wanted", [FEWEST_ACTIONS - 1, 101])
 def test_too_few_or_too_many_actions_are_refused(car, wanted):
     assert f"--count {wanted}" in refused(propose_actions, commands([0], [1]), wanted, car)
 

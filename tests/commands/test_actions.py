@@ -8,12 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepracer_exp.commands.actions import FREE
+from deepracer_exp.commands.actions import FREE, write_lap_actions
 from deepracer_exp.commands.tracks import experiment_on
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.action_space import build_action_space, describe_actions
 from deepracer_exp.fastest.lap import COLUMNS, FastestLap, Question, _keep
+from deepracer_exp.sweeps.plan import plan_sweep
 from tests.aws.made_up_logs import write_run_as_logs
+from tests.conftest import refused
 
 LAPS = ("track=Straight_track", "action_space=deepracer", "reward=speed_on_track", "budget.env_steps=16384")
 
@@ -82,6 +84,53 @@ def test_the_fastest_lap_of_a_track_has_actions(call, tmp_path, monkeypatch):
     assert {speed for _, speed in listed} == {1.3, 2.0, 3.0, 4.0}
     assert {angle for angle, _ in listed if angle <= 0} == {-30.0, -10.0, 0.0}
     assert metadata["version"] == "5"
+
+
+def test_a_sweep_gets_the_lists_of_the_command_once(call, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    plan = plan_sweep(["sweep=season"], is_only_shown=True)
+    assert plan.lap_actions is not None
+    write_lap_actions(plan.lap_actions)
+    assert call("actions", "reinvent_base", "--name", "mine", "--count", "12").code == 0
+    assert described("action_space=lap12-reinvent_base") == described("action_space=mine")
+    files = {file: file.stat().st_mtime_ns for file in (tmp_path / "conf" / "action_space").iterdir()}
+    assert {file.stem for file in files} == {"lap12-reinvent_base", "lap20-reinvent_base", "mine"}
+    write_lap_actions(plan.lap_actions)
+    assert {file: file.stat().st_mtime_ns for file in files} == files
+
+
+@pytest.mark.parametrize(
+    ("overrides", "searched"),
+    [
+        (["track=Oval_track"], "continuous,discrete_fast,lap12-Oval_track,lap20-Oval_track"),
+        (["track=Ace Speedway", "sweep.lap_actions=[9]"], "continuous,discrete_fast,lap9-2022_april_open"),
+        (
+            ["car=deepracer_v5", "track.direction=reversed", "sweep.lap_actions=[9]"],
+            "continuous,discrete_fast,lap9-reinvent_base-deepracer_v5-reversed",
+        ),
+        # Those that the command line names are all.
+        (["action_space=discrete,grid"], "discrete,grid"),
+        (["action_space=discrete"], None),
+        (["sweep.lap_actions=[]"], "continuous,discrete_fast"),
+    ],
+)
+def test_lists_from_a_lap_compete_with_the_actions_of_a_ready_made_search(overrides, searched):
+    plan = plan_sweep(["sweep=season", *overrides], is_only_shown=True)
+    assert plan.request.space.get("action_space") == searched
+    assert (plan.lap_actions is None) == ("lap" not in str(searched))
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("track=[Oval_track,reinvent_base]", "2 tracks; accepted: one track"),
+        ("track=Oval_track,reinvent_base", "track is searched"),
+        ("sweep.lap_actions=[5]", "sweep.lap_actions"),
+        ("sweep.lap_actions=[12,12]", "one is listed twice"),
+    ],
+)
+def test_lists_from_a_lap_need_one_track_and_a_number_of_actions(override, words):
+    assert words in refused(plan_sweep, ["sweep=season", override], is_only_shown=True)
 
 
 def test_a_training_takes_them(run_dir, call, train_here):

@@ -221,7 +221,7 @@ def test_a_sweep_that_ends_in_its_last_stage_resumes_the_clone_and_no_trial(
     sweep, start, tmp_path, is_killed, seed
 ):
     """The clone has each of its iterations once, in one folder, whether the sweep was killed or got a Ctrl-C."""
-    iterations, runs = 60, tmp_path / "runs" / "s"
+    iterations, runs = 30, tmp_path / "runs" / "s"
     clone = f"sweep.clone={{randomization: sim2real, budget.iterations: {iterations}}}"
     running = sweep("sweep.workers=2", "sweep.rerank_laps=2", clone)
     rows = 1 + random.Random(seed).randrange(iterations // 2)
