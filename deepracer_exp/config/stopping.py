@@ -62,11 +62,12 @@ class ConvergedRule:
 
 @dataclass(frozen=True, kw_only=True)
 class OverfittingRule:
-    """The policy improves on the training's conditions only."""
+    """The policy becomes less sure on held-out conditions, and its laps hardly faster."""
 
     warmup: Natural
     patience: Count
     held_out_drop: Percent
+    lap_gain: Fraction = 1.0
     return_drop: Fraction
 
 

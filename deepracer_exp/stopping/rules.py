@@ -12,6 +12,7 @@ from deepracer_exp.config.stopping import (
     ConvergedRule,
     EntropyStopping,
     LapsSlowerRule,
+    OverfittingRule,
     PlateauStopping,
     ReliableStopping,
     StoppingConfig,
@@ -222,7 +223,7 @@ class TrendRule(StoppingRule):
         rules: tuple[tuple[str, Any, tuple[str, ...], Callable[..., Reason | None]], ...] = (
             ("collapsed", config.collapsed, ("entropy", "completion"), trends.collapsed),
             ("not_learning", config.not_learning, ("entropy", "completion"), not_learning),
-            ("overfitting", config.overfitting, ("held_out_completion", "mean_return"), trends.overfits),
+            ("overfitting", config.overfitting, ("held_out_completion", "mean_return"), self._overfits),
             ("laps_slower", config.laps_slower, (_LAP_SPEED, "mean_return"), self._laps_slower),
             ("converged", config.converged, _GROWTH, self._converged),
         )
@@ -236,6 +237,9 @@ class TrendRule(StoppingRule):
             ):
                 return _decision(name, *reason, rule)
         return None
+
+    def _overfits(self, rule: OverfittingRule, held_out: Average, returns: Average) -> Reason | None:
+        return trends.overfits(rule, held_out, returns, self.averages[_LAP_SPEED])
 
     def _laps_slower(self, rule: LapsSlowerRule, speed: Average, returns: Average) -> Reason | None:
         scores_s = self._race_scores_s

@@ -100,15 +100,26 @@ def not_learning(
     return why, {"entropy": lowest, "completion_start": start, "completion": best}
 
 
-def overfits(rule: OverfittingRule, held_out: Average, returns: Average) -> Reason | None:
-    """Return why a policy that improves on the training's conditions only should end."""
+def overfits(rule: OverfittingRule, held_out: Average, returns: Average, speed: Average) -> Reason | None:
+    """Return why a policy that completes less on held-out conditions, for laps hardly faster, should end.
+
+    `speed` as in `laps_slower`; where it has no average before the last `patience` rows, the return alone says whether
+    the policy still improves.
+    """
     before, since = held_out.bests(rule.patience)
     lowest_return = returns.best - rule.return_drop * returns.range
     if since > before - rule.held_out_drop or returns.now < lowest_return:
         return None
-    why = f"held-out completion fell from {before:.0f}% to {since:.0f}% while the return holds"
-    completions = {"held_out_completion_before": before, "held_out_completion_since": since}
-    return why, completions | {"return": returns.now, "return_best": returns.best}
+    values = {"held_out_completion_before": before, "held_out_completion_since": since}
+    values |= {"return": returns.now, "return_best": returns.best}
+    meanwhile = "the return holds"
+    if speed.reaches_back(rule.patience):
+        speed_before, speed_since = speed.bests(rule.patience)
+        if speed_since > speed_before * (1 + rule.lap_gain):
+            return None
+        meanwhile = f"the fastest laps went from {1 / speed_before:.2f} to {1 / speed_since:.2f} s"
+        values |= {"lap_time_s_before": 1 / speed_before, "lap_time_s_since": 1 / speed_since}
+    return f"held-out completion fell from {before:.0f}% to {since:.0f}% while {meanwhile}", values
 
 
 def laps_slower(rule: LapsSlowerRule, speed: Average, returns: Average) -> Reason | None:

@@ -84,10 +84,11 @@ def converging(until: int, **more) -> list[dict]:
     return history(**driven | more)
 
 
-def falling(**more) -> list[dict]:
+def falling(iterations: int = LONG, **more) -> list[dict]:
     """Held-out completion rises to 90 and falls to 50, as the return rises on."""
     held_out = {"held_out": lambda i: 90 * i / 50 if i <= 50 else max(50.0, 140 - i)}
-    return history(**{"completion": learned(LONG), "mean_return": learned(LONG)} | held_out | more)
+    grows = {"completion": learned(LONG), "mean_return": learned(LONG)}
+    return history(iterations, **grows | held_out | more)
 
 
 def slowing(**more) -> list[dict]:
@@ -119,6 +120,7 @@ def assert_reported(decision: Decision) -> None:
         ("not_learning", history(**RANDOM), 42, 3),
         ("collapsed", history(completion=20.0, entropy=lambda i: max(0.01, 1 - 0.1 * i)), 31, 3),
         ("overfitting", falling(), 110, 19),
+        ("overfitting", falling(lap_time_s=lambda i: 9 - i / LONG), 110, 19),
         ("laps_slower", slowing(), 165, 15),
     ],
 )
@@ -147,6 +149,7 @@ def test_each_rule_ends_the_run_that_it_is_for(name, rows, at, within):
         "random but decides": history(60, **RANDOM | {"entropy": lambda i: 1 - 0.005 * i}),
         "random but drives": history(60, **RANDOM | {"completion": 60.0}),
         "no evaluations": falling(held_out=None),
+        "held-out completion falls as laps become faster": falling(120, lap_time_s=lambda i: 9 - 4 * i / 120),
         "held-out completion rises": falling(held_out=learned(LONG)),
         "held-out completion holds": falling(held_out=80.0),
         "held-out completion wobbles": falling(held_out=lambda i: 80.0 + 4 * (-1) ** (i // 5)),
