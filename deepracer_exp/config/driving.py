@@ -280,10 +280,12 @@ class RandomizationConfig:
     observation_dropout: Range[Fraction]
     pictures: PictureRandomizationConfig | None = None
     real_car: CarRandomizationConfig | None = None
+    car_share: Fraction = 1.0
+    """Share of the cars that differ; the others have no randomization."""
 
 
-_GROUPS = ("pictures", "real_car")
+_OTHER_KEYS = ("pictures", "real_car", "car_share")
 """Keys of `RandomizationConfig` that are no range; what they draw is not in the trace."""
-QUANTITIES = tuple(field.name for field in fields(RandomizationConfig) if field.name not in _GROUPS)
+QUANTITIES = tuple(field.name for field in fields(RandomizationConfig) if field.name not in _OTHER_KEYS)
 OFF = {name: 1.0 if name.endswith("_scale") else 0.0 for name in QUANTITIES}
 """The value of each quantity that has no effect."""

@@ -19,7 +19,7 @@ from .observation import Features
 from .others import RaceOthers
 from .picture_randomization import PictureRandomization
 from .pictures import Pictures
-from .randomization import Randomization
+from .randomization import Randomization, of_each_car
 from .real_car import Servos
 from .real_car_randomization import RealCarRandomization
 from .rival import RaceRival
@@ -83,7 +83,6 @@ class Race:
             prints: where `print` of a reward function goes; None: nowhere.
             randomizations: of each car, (N,); None: the setup's for all.
         """
-        randomizations = randomizations or [setup.randomization] * n_cars
         self.setup = setup
         self.n_cars = n_cars
         self.rules = RaceRules(setup, n_cars, first_car)
@@ -102,7 +101,9 @@ class Race:
         self._features = Features(
             setup.observation, self.rules.tracks, steering_max_deg, high[1], setup.observation_parts
         )
-        of_car, numbers = [randomization.real_car for randomization in randomizations], self.cars.tolist()
+        numbers = self.cars.tolist()
+        randomizations = of_each_car(randomizations or [setup.randomization] * n_cars, numbers)
+        of_car = [randomization.real_car for randomization in randomizations]
         fixed = setup.real_car
         real_car = RealCarRandomization(of_car, numbers, self._batch, fixed, setup.late_steps)
         self._real_car = real_car

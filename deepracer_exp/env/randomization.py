@@ -1,6 +1,8 @@
 """Domain randomization: what each car draws for each of its episodes, from its own random streams."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from enum import IntEnum
 from typing import Any
 
@@ -22,6 +24,8 @@ _COLUMN = {name: column for column, name in enumerate(QUANTITIES)}
 _KNOWN = ("last_steering", "last_speed")
 """Features that are commands, not measurements, and therefore exact."""
 
+
+_GOLDEN_RATIO = (math.sqrt(5) - 1) / 2
 
 # Numbers drawn from a generator at once: one number from each of 256 generators would cost 0.5 ms a step.
 _BLOCK = 128
@@ -101,6 +105,23 @@ class StepNoise:
             self._block_number = number
         self.steps += 1
         return self._block[:, place]
+
+
+def of_each_car(configs: Sequence[RandomizationConfig], cars: Sequence[int]) -> list[RandomizationConfig]:
+    """Return each car's randomization, (N,): that of its config, or none for cars outside of its `car_share`.
+
+    `cars` are their numbers over all processes. Multiples of the golden ratio, modulo 1, are spread evenly over all cars
+    and over every second or third of them (Weyl's theorem): on each of several tracks about the same share differs. Car 0
+    differs with a share of 1 only.
+    """
+    return [
+        config if car * _GOLDEN_RATIO % 1 >= 1 - config.car_share else _without(config)
+        for config, car in zip(configs, cars, strict=True)
+    ]
+
+
+def _without(config: RandomizationConfig) -> RandomizationConfig:
+    return replace(config, **{name: (off, off) for name, off in OFF.items()}, pictures=None, real_car=None)
 
 
 class Randomization:

@@ -14,8 +14,12 @@ from deepracer_exp.env.trace import PACKED
 
 @cache
 def make_setup(*overrides: str) -> RaceSetup:
-    """Compose and build a setup with the list of 15 actions, unless another space is named, once for all tests."""
-    plain = () if any(line.startswith("action_space=") for line in overrides) else ("action_space=discrete",)
+    """Compose and build a setup, once for all tests: the list of 15 actions and plain cars, unless others are named."""
+    plain = [
+        f"{group}={option}"
+        for group, option in (("action_space", "discrete"), ("randomization", "none"))
+        if not any(line.startswith(f"{group}=") for line in overrides)
+    ]
     return build_setup(compose_experiment([*plain, *overrides])[0])
 
 

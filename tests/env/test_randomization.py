@@ -9,7 +9,7 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.driving import OFF, QUANTITIES
 from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.env.race import Race
-from deepracer_exp.env.randomization import CarStreams
+from deepracer_exp.env.randomization import CarStreams, of_each_car
 from deepracer_exp.env.trace import PACKED, RANDOMIZED
 from deepracer_exp.errors import BadInput
 from deepracer_exp.sim.batch import CarBatch
@@ -118,6 +118,26 @@ def test_the_seed_decides_the_draws_and_seeding_begins_again():
     race.seed(0)
     race.reset()
     np.testing.assert_array_equal(drive(race, actions), first)
+
+
+@pytest.mark.parametrize(("share", "fewest", "most"), [(0.0, 0, 0), (0.25, 15, 17), (0.5, 31, 33), (1.0, 64, 64)])
+def test_a_share_of_the_cars_differs_and_the_others_drive_as_without_randomization(share, fewest, most):
+    actions = random_actions(30, 64)
+    some, none = (
+        drive(race_of(option, n_cars=64, **keys), actions)
+        for option, keys in (("sim2real", {"car_share": share}), ("none", {}))
+    )
+    as_configured = (some[:, :, DRAWN] == list(OFF.values())).all(axis=(0, 2))
+    assert fewest <= np.count_nonzero(~as_configured) <= most
+    np.testing.assert_array_equal(some[:, as_configured], none[:, as_configured])
+
+
+@pytest.mark.parametrize("tracks", [2, 3, 5])
+def test_cars_differ_by_the_same_share_on_each_of_several_tracks(tracks):
+    config = make_setup("randomization=mixed", "action_space=continuous").randomization
+    differs = [each is config for each in of_each_car([config] * 240, range(240))]
+    for course in range(tracks):
+        assert 0.4 <= np.mean(differs[course::tracks]) <= 0.6
 
 
 def test_switching_one_quantity_off_leaves_the_draws_of_the_others():
