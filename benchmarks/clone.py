@@ -1,15 +1,17 @@
-"""Is a clone that learns at a tenth of the rate better than one that continues at the same rate?
+"""What does each kind of clone bring?
 
     python -m benchmarks.clone [--seeds 5] [--steps 1000000] [--more 500000] [--jobs 2] [--json FILE] [OVERRIDE...]
 
 For each seed `deepracer-exp train` runs the default experiment for `--steps` control steps, whatever a stopping rule
-would say, so that all parents are of the same age. Its best checkpoint is then cloned twice, each time with a fresh
-optimizer, for `--more` steps: by `deepracer-exp clone RUN`, which lowers the learning rate to a tenth, and with
-algorithm.lr as it was. The best checkpoint of each of the three drives 64 laps on usual and 64 on held-out conditions,
-with starts and draws that no evaluation of the training had.
+would say, so that all parents are of the same age. Its best checkpoint is then cloned three times, each time with a
+fresh optimizer, for `--more` steps: by `deepracer-exp clone RUN`, which lowers the learning rate to a tenth; with
+algorithm.lr as it was; and with `randomization=sim2real` at a tenth. The best checkpoint of each of the four drives 64
+laps on usual and 64 on held-out conditions, with starts and draws that no evaluation of the training had. OVERRIDE
+changes the parents, e.g. `randomization=none`.
 
-Figures are means over seeds with Student's 95% interval. Both clones have the same parent, so that their differences
-within a seed say more than those of the means: `tenth_minus_same`, and how much faster than the parent each is.
+Figures are means over seeds with Student's 95% interval; `minutes` is the wall time of a training with `--jobs` at once.
+All clones have the same parent, so that their differences within a seed say more than those of the means:
+`tenth_minus_parent` and the like.
 """
 
 import json
@@ -26,13 +28,14 @@ from .command import at_once, read_summary, train
 from .fresh import TRIALS, drive
 from .report import benchmark_parser, interval_text, mean_and_interval, number, table, write_json
 
-POLICIES = ("parent", "tenth", "same")
-"""The trained run, and its clones by their rate."""
-FIGURES = ("lap_time_s", "completion", "lap_share", "held_out_lap_time_s", "held_out_completion")
+CLONES = ("tenth", "same", "sim2real")
+POLICIES = ("parent", *CLONES)
+"""The trained run, and its clones by what they change."""
+FIGURES = ("lap_time_s", "completion", "lap_share", "held_out_lap_time_s", "held_out_completion", "minutes")
 
 
 def train_family(folder: Path, seed: int, steps: int, more: int, overrides: Sequence[str]) -> dict[str, Path]:
-    """Train a parent and its two clones in `folder` and return their runs."""
+    """Train a parent and its clones in `folder` and return their runs."""
     folder.mkdir()
     always = ("stopping=none", "tracking=off")
     parent = train([*overrides, *always, f"budget.env_steps={steps}", f"seed={seed}"], folder)
@@ -41,6 +44,7 @@ def train_family(folder: Path, seed: int, steps: int, more: int, overrides: Sequ
         "parent": parent,
         "tenth": train(cloned, folder, "clone"),
         "same": train([*cloned, f"algorithm.lr={learning_rate(parent)}"], folder, "clone"),
+        "sim2real": train([*cloned, "randomization=sim2real"], folder, "clone"),
     }
 
 
@@ -51,6 +55,7 @@ def measure(run: Path) -> dict[str, Any]:
         "lr": learning_rate(run),
         "env_steps": summary["env_steps"],
         "best_iteration": summary["best"]["iteration"],
+        "minutes": summary["wall_clock_s"] / 60,
         **asdict(drive(run, ["best"])[0]),
     }
 
@@ -64,30 +69,29 @@ def learning_rate(run: Path) -> float:
 def summarize(seeds: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return means and intervals over seeds, of each policy and of the differences within a seed."""
 
-    def difference(one: str, other: str, figure: str) -> list[float | None]:
-        pairs = [(seed[one][figure], seed[other][figure]) for seed in seeds]
+    def difference(name: str, figure: str) -> list[float | None]:
+        pairs = [(seed[name][figure], seed["parent"][figure]) for seed in seeds]
         return [None if None in pair else pair[0] - pair[1] for pair in pairs]
 
-    pairs = (("tenth", "same"), ("tenth", "parent"), ("same", "parent"))
     return {
         **{
             name: {figure: mean_and_interval([seed[name][figure] for seed in seeds]) for figure in FIGURES}
             for name in POLICIES
         },
         **{
-            f"{one}_minus_{other}": {
-                figure: mean_and_interval(difference(one, other, figure)) for figure in FIGURES
+            f"{name}_minus_parent": {
+                figure: mean_and_interval(difference(name, figure)) for figure in FIGURES
             }
-            for one, other in pairs
+            for name in CLONES
         },
     }
 
 
 def markdown(seeds: Sequence[dict[str, Any]], summary: dict[str, Any]) -> str:
     """Return the table of seeds, means and differences."""
-    head = ("", "lap (s)", "done (%)", "complete laps", "held-out lap (s)", "held-out done (%)")
+    head = ("", "lap (s)", "done (%)", "complete laps", "held-out lap (s)", "held-out done (%)", "minutes")
     show = {
-        name: partial(number, digits=digits) for name, digits in zip(FIGURES, (2, 1, 2, 2, 1), strict=True)
+        name: partial(number, digits=digits) for name, digits in zip(FIGURES, (2, 1, 2, 2, 1, 1), strict=True)
     }
     rows = [
         (f"seed {seed['seed']}, {name}", *(show[figure](seed[name][figure]) for figure in FIGURES))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks import longer
+from benchmarks.fresh import Driven
 from deepracer_exp.analysis.evidence import estimate
 
 
@@ -31,6 +32,7 @@ def test_each_seed_of_each_group_is_trained_once_and_laps_are_held_against_the_b
         rows = [
             row
             | {"env_steps": steps, "eval_completion": 90.0, "eval_lap_share": 0.5, "eval_lap_time_s": lap_s}
+            | {"held_out_completion": 60.0 + 10 * seed}
             for steps, lap_s in zip((500_000, 1_400_000, 1_600_000), seconds[seed], strict=True)
         ]
         lines = [rows[0], row | {"env_steps": 900_000, "eval_completion": None}, *rows[1:]]
@@ -38,6 +40,22 @@ def test_each_seed_of_each_group_is_trained_once_and_laps_are_held_against_the_b
         return place
 
     monkeypatch.setattr(longer, "trained", run)
+    def drive(folder: Path, checkpoints: list[str]) -> list[Driven]:
+        """Return fresh laps of the best checkpoint: the last seed has none."""
+        assert checkpoints == ["best"]
+        seed = int(folder.parents[2].name[-1])
+        lap_s = None if seed == 3 else 8.0 + seed
+        return [
+            Driven(
+                completion=99.0,
+                lap_share=0.9,
+                lap_time_s=lap_s,
+                held_out_completion=90.0 + seed,
+                held_out_lap_time_s=lap_s,
+            )
+        ]
+
+    monkeypatch.setattr(longer, "drive", drive)
     monkeypatch.setattr(longer, "lap_bound_s", lambda _: 8.0)  # takes seconds
     file = tmp_path / "longer.json"
     words = ["--seeds", "4", "--tracks", "reinvent_base", "--runs-dir", str(tmp_path), "--json", str(file)]
@@ -53,4 +71,6 @@ def test_each_seed_of_each_group_is_trained_once_and_laps_are_held_against_the_b
     assert figures["worst_rise"] == pytest.approx(8.75 / 9.15 - 1, abs=1e-4)
     assert figures["over_bound"] == pytest.approx(9.15 / 8 - 1, abs=1e-4)
     assert figures["over_bound_end"] == pytest.approx(8.75 / 8 - 1, abs=1e-4)
+    assert figures["held_out"] == [75.0, 75.0, 75.0]
+    assert (figures["best"]["lap_s"], figures["best"]["held_out"]) == (9.5, 91.5)
     assert "`reinvent_base`, fast_lap" in capsys.readouterr().out
