@@ -9,7 +9,7 @@ algorithm.lr as it was; and with `randomization=sim2real` at a tenth. The best c
 laps on usual and 64 on held-out conditions, with starts and draws that no evaluation of the training had. OVERRIDE
 changes the parents, e.g. `randomization=none`.
 
-Figures are means over seeds with Student's 95% interval; `minutes` is the wall time of a training with `--jobs` at once.
+Figures are means over seeds with Student's 95% interval; `minutes` is the wall time of a training, `--jobs` at once.
 All clones have the same parent, so that their differences within a seed say more than those of the means:
 `tenth_minus_parent` and the like.
 """

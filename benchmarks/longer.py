@@ -10,8 +10,8 @@ the recipe's own collector; `--jobs` runs train at once.
 
 Every ten iterations a training evaluates the most probable actions of its policy on the usual conditions. Of the mean
 time of the complete laps this takes the interquartile mean over seeds with its 95% bootstrap interval; a seed whose
-policy completes no lap is slower than any. At the end the best checkpoint of each seed drives 64 fresh laps on usual and
-64 on held-out conditions. JSON has for each track and recipe, in lists a value an evaluation:
+policy completes no lap is slower than any. At the end the best checkpoint of each seed drives 64 fresh laps on usual
+conditions and 64 on held-out ones. JSON has for each track and recipe, in lists a value an evaluation:
 
 - `steps`, control steps over all cars; `laps_s` and `interval_s`, null where more than a quarter of the seeds completes
   no lap; `lap_share`, complete laps of those tried, mean over seeds;
@@ -164,8 +164,8 @@ def benchmark(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     print(f"{len(asked)} runs of {len(places)} groups, {options.jobs} at once", flush=True)
     runs = at_once(options.jobs, asked)
     found: dict[str, dict[str, Any]] = {track: {} for track in tracks}
-    for number, (track, recipe) in enumerate(places):
-        of_group = runs[number * options.seeds : (number + 1) * options.seeds]
+    for place, (track, recipe) in enumerate(places):
+        of_group = runs[place * options.seeds : (place + 1) * options.seeds]
         driven = [drive(run, ["best"])[0] for run in of_group]
         found[track][recipe] = measure(of_group, driven, bounds[track, recipe])
     return found

@@ -110,9 +110,9 @@ class StepNoise:
 def of_each_car(configs: Sequence[RandomizationConfig], cars: Sequence[int]) -> list[RandomizationConfig]:
     """Return each car's randomization, (N,): that of its config, or none for cars outside of its `car_share`.
 
-    `cars` are their numbers over all processes. Multiples of the golden ratio, modulo 1, are spread evenly over all cars
-    and over every second or third of them (Weyl's theorem): on each of several tracks about the same share differs. Car 0
-    differs with a share of 1 only.
+    `cars` are their numbers over all processes. Multiples of the golden ratio, modulo 1, are spread evenly over all
+    cars, and over every second or third of them (Weyl's theorem), so that on each of several tracks about the same
+    share differs. Car 0 differs with a share of 1 only.
     """
     return [
         config if car * _GOLDEN_RATIO % 1 >= 1 - config.car_share else _without(config)
@@ -121,7 +121,8 @@ def of_each_car(configs: Sequence[RandomizationConfig], cars: Sequence[int]) -> 
 
 
 def _without(config: RandomizationConfig) -> RandomizationConfig:
-    return replace(config, **{name: (off, off) for name, off in OFF.items()}, pictures=None, real_car=None)
+    off: dict[str, Any] = {name: (value, value) for name, value in OFF.items()}
+    return replace(config, **off, pictures=None, real_car=None)
 
 
 class Randomization:

@@ -37,9 +37,7 @@ _WINDOW = 3
 """Iterations of the moving averages."""
 POOR = 50.0
 """Completion below which a training that no longer grows has not learned to drive, per cent."""
-LOG_OVERFITTING = OverfittingRule(
-    warmup=0, patience=3, held_out_drop=10.0, lap_gain=0.02, return_drop=0.05
-)
+LOG_OVERFITTING = OverfittingRule(warmup=0, patience=3, held_out_drop=10.0, lap_gain=0.02, return_drop=0.05)
 """The rule of overfitting for the logs of others, which have an evaluation after each iteration."""
 _FEWEST_EVALUATIONS = 6
 

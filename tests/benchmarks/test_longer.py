@@ -40,6 +40,7 @@ def test_each_seed_of_each_group_is_trained_once_and_laps_are_held_against_the_b
         return place
 
     monkeypatch.setattr(longer, "trained", run)
+
     def drive(folder: Path, checkpoints: list[str]) -> list[Driven]:
         """Return fresh laps of the best checkpoint: the last seed has none."""
         assert checkpoints == ["best"]

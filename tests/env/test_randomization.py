@@ -120,7 +120,9 @@ def test_the_seed_decides_the_draws_and_seeding_begins_again():
     np.testing.assert_array_equal(drive(race, actions), first)
 
 
-@pytest.mark.parametrize(("share", "fewest", "most"), [(0.0, 0, 0), (0.25, 15, 17), (0.5, 31, 33), (1.0, 64, 64)])
+@pytest.mark.parametrize(
+    ("share", "fewest", "most"), [(0.0, 0, 0), (0.25, 15, 17), (0.5, 31, 33), (1.0, 64, 64)]
+)
 def test_a_share_of_the_cars_differs_and_the_others_drive_as_without_randomization(share, fewest, most):
     actions = random_actions(30, 64)
     some, none = (
