@@ -89,19 +89,20 @@ class StepNoise:
         steps: number of steps drawn; setting it continues from there.
     """
 
-    def __init__(self, streams: CarStreams, n_cars: int, width: int):
-        """Start at step 0, with `width` numbers per car and step."""
+    def __init__(self, streams: CarStreams, n_cars: int, width: int, cars: Ids | None = None):
+        """Start at step 0, with `width` numbers per car and step; cars other than `cars` have zeros, None: all draw."""
         self.steps = 0
         self._streams = streams
-        self._block = np.empty((n_cars, _BLOCK, width))
+        self._drawing = range(n_cars) if cars is None else cars.tolist()
+        self._block = np.zeros((n_cars, _BLOCK, width))
         self._block_number = -1
 
     def normal(self) -> np.ndarray:
         """Return the next numbers of each car, shape (cars, width)."""
         number, place = divmod(self.steps, _BLOCK)
         if number != self._block_number:
-            for car, numbers in enumerate(self._block):
-                self._streams.stream(car, number).standard_normal(out=numbers)
+            for car in self._drawing:
+                self._streams.stream(car, number).standard_normal(out=self._block[car])
             self._block_number = number
         self.steps += 1
         return self._block[:, place]
@@ -156,7 +157,9 @@ class Randomization:
         self._rows = np.arange(len(self._cars))
         self._low: Floats = ranges[..., 0]
         self._span: Floats = ranges[..., 1] - self._low
-        # A quantity that is on for one car has no effect on cars with OFF values.
+        # A quantity that is on for one car has no effect on cars with OFF values, which draw nothing.
+        off = np.array(list(OFF.values()))[:, None]
+        self._differs: NDArray[np.bool_] = (ranges != off).any(axis=(1, 2))
         self._on = {name for name, place in _COLUMN.items() if (ranges[:, place] != OFF[name]).any()}
         varying = {name for name, place in _COLUMN.items() if self._span[:, place].any()}
         # 0, 1 and 2 steps are drawn with equal probability.
@@ -222,6 +225,7 @@ class Randomization:
         noisy = "observation_noise" in self._on
         if not (self._draws or noisy):
             return
+        ids, episodes = ids[self._differs[ids]], episodes[self._differs[ids]]
         uniform = np.empty((len(ids), len(QUANTITIES)))
         for row, (place, episode) in enumerate(zip(ids.tolist(), episodes.tolist(), strict=True)):
             stream = self._episodes.stream(place, episode)
@@ -299,7 +303,8 @@ class Randomization:
         return np.asarray(deviation * normal, np.float32)
 
     def _step_noise(self, seed: int, purpose: Purpose, width: int) -> StepNoise:
-        return StepNoise(CarStreams(seed, self._cars, purpose), len(self._cars), width)
+        streams, cars = CarStreams(seed, self._cars, purpose), np.flatnonzero(self._differs)
+        return StepNoise(streams, len(self._cars), width, cars)
 
     def _of(self, name: str) -> Floats:
         return self.values[:, _COLUMN[name]]
