@@ -124,7 +124,7 @@ def describe_actions(actions: ActionSpace) -> str:
 
 
 def action_remarks(actions: ActionSpace, car: CarConfig) -> list[str]:
-    """Return a line for what the car makes of actions beyond its limits, and for actions that are equal then."""
+    """Return a line for each limit that clips an action, and for each set of actions that are equal once clipped."""
     low = np.array([-car.max_steering_deg, car.min_speed_mps])
     high = np.array([car.max_steering_deg, car.max_speed_mps])
     remarks = []

@@ -22,7 +22,7 @@ class RaceFiles:
     tracks: "Mapping[str, tuple[Track, ...]]"
     """The tracks that have a file, by name, in each direction in which they are driven."""
     remarks: tuple[str, ...]
-    """A line for each thing about the action space that a racer may not have meant."""
+    """Warnings about an action space that a racer may not have meant, a line each."""
 
 
 def read_race_files(experiment: Experiment) -> RaceFiles:

@@ -6,8 +6,8 @@ import deepracer_exp.env.gym_env
 env = gymnasium.make("DeepRacer/Oval_track-v0")
 cars = gymnasium.make_vec("DeepRacer-v0", num_envs=64, overrides=["action_space=continuous"])
 
-An id stands for the default experiment, of the track it names. A change after which results of the same id no longer
-compare raises its version.
+An id stands for the default experiment on the track in its name. Its version is raised by a change that makes older
+results incomparable.
 """
 
 from collections.abc import Sequence

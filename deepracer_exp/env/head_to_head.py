@@ -1,4 +1,4 @@
-"""Races of two: the learner's cars, and beside each of them one that a frozen policy drives."""
+"""Head-to-head races: each of the learner's cars races a rival that a frozen policy drives."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ from .state import checked_array
 from .trace import PACKED, STATUS_CODE
 
 Weights = Mapping[str, np.ndarray]
-"""The tensors of a policy by name, as arrays, which processes and checkpoints pass on without a pickle of PyTorch's."""
+"""Tensors of a policy by name, as NumPy arrays, which processes and checkpoints exchange without PyTorch's pickle."""
 
 _STATUS, _PROGRESS = PACKED["episode_status"], PACKED["progress"]
 _LAP, _PAUSE, _CRASHED, _GOING = (
@@ -34,7 +34,7 @@ _LAP, _PAUSE, _CRASHED, _GOING = (
 
 
 def rival_setup(setup: RaceSetup, observation: ObservationConfig) -> RaceSetup:
-    """Return the race of the rivals of a race: the same cars, tracks and conditions, with what their policy observes.
+    """Return the setup of a race's rivals: the same cars, tracks and conditions, with their policy's observation.
 
     Raises:
         BadInput: one of the user's own parts of the observation cannot be used.
@@ -61,9 +61,9 @@ class Rivals:
     setup: RaceSetup
     """The rivals' race, of `rival_setup`."""
     policy: torch.nn.Module
-    """The layers; their weights do not count."""
+    """The layers; their weights are not used."""
     weights: tuple[Weights, ...]
-    """One entry for each policy that an episode may draw."""
+    """Weights of the policies from which each episode draws its rival's."""
 
     def policies(self, weights: Sequence[Weights]) -> list[torch.nn.Module]:
         """Return a policy for each set of weights."""
@@ -138,7 +138,7 @@ class HeadToHead(Race):
         super().__init__(setup, n_cars, threads, first_car, prints, randomizations)
 
     def drive_with(self, policies: Sequence[torch.nn.Module]) -> None:
-        """Let policies drive the rivals, in each episode one of them, drawn with equal chances.
+        """Let policies drive the rivals, in each episode one of them, drawn uniformly.
 
         They read what the rivals observe and write `action`. Episodes under way continue with the policy at the same
         share of the list.
@@ -270,7 +270,7 @@ class HeadToHead(Race):
 
 
 def _likeliest(policy: torch.nn.Module, seen: TensorDict) -> torch.Tensor:
-    """Return the policy's likeliest actions, of a continuous one the means; what is not drawn from has one anyway."""
+    """Return a policy's likeliest actions, of a continuous one the means."""
     get_dist = getattr(policy, "get_dist", None)
     if get_dist is None:
         return policy(seen)["action"]

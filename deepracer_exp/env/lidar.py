@@ -1,4 +1,4 @@
-"""The LIDAR of an observation: what each car's scanner reads, in the forms of the service's three sensors."""
+"""The LIDAR of an observation: each car's readings, in the forms of the service's three sensors."""
 
 from collections.abc import Sequence
 
@@ -154,9 +154,9 @@ def readings(config: LidarConfig, distances_m: NDArray[np.float64]) -> Readings:
 
 
 def reach_of_rays(config: LidarConfig, seen: Readings) -> NDArray[np.float64]:
-    """Return how far each ray got, metres, (n, RAYS), from what the policy sees, (n, size); NaN: nothing was there.
+    """Return the range of each ray in metres, (n, RAYS), from readings (n, size); NaN: no hit.
 
-    All rays of a sector get as far as the end of the step that its nearest thing is in.
+    In a sector, it is the far end of the step that holds the nearest hit.
     """
     furthest_m = config.furthest_m
     if config.kind == "plain":

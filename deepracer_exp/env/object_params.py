@@ -1,4 +1,4 @@
-"""The params about boxes and bots that reward functions get, with the service's mistakes where they are wanted."""
+"""The params of reward functions about boxes and bots, on request with the service's mistakes."""
 
 from typing import Literal
 
@@ -19,11 +19,11 @@ _EYE_M, _EYE_PITCH_RAD, _NEAREST_M = (0.14529379, 0.13032555), 0.2618, 0.2
 
 
 class ObjectParams:
-    """Makes the columns `rewards.params.OBJECT_COLUMNS` of N cars.
+    """Computes the columns `rewards.params.OBJECT_COLUMNS` of N cars.
 
     Args:
-        others: of the cars.
-        rules: of the same cars.
+        others: boxes and bots around the cars.
+        rules: race rules of the same cars.
         quirks: `service` for params with the mistakes of the service.
         bots_mps: speed of bots in m/s; None: there are none.
     """
@@ -37,7 +37,7 @@ class ObjectParams:
         self._mask = np.ones(others.distance_m.shape, bool)
 
     def columns(self, now: Measures, time_s: Floats) -> dict[str, np.ndarray]:
-        """Return the columns but `is_crashed`, which is not known yet, and `objects_mask`, one row per car.
+        """Return all columns except `is_crashed`, which is not known yet, and `objects_mask`; one row per car.
 
         Args:
             now: poses of the cars.
@@ -47,7 +47,7 @@ class ObjectParams:
         nearest = closest(others.distance_m, now.ndist * self._rules.length_m)
         return {
             "closest_objects": nearest,
-            # The service counts the own car as number 0 here and not there.
+            # The service counts the agent's own car as number 0 here but not there.
             "object_in_camera": self._in_camera(now, nearest[:, 1] - self._as_service),
             "objects_location": others.poses[..., :2].copy(),
             "objects_left_of_center": others.offset_m > 0,

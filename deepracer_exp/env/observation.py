@@ -16,9 +16,9 @@ from deepracer_exp.tracks.track import TrackIndex, Tracks
 from .state import Measures
 
 OTHERS = ("gap", "side", "closing", "bot")
-"""What is observed of each of the next others, see `RaceOthers.features`."""
+"""Features of each of the next boxes and bots, see `RaceOthers.features`."""
 _ABSENT = np.array([1, 0, 0, 0], np.float32)
-"""Values observed in place of an other that is not there."""
+"""Values of these features where there is no box or bot."""
 
 
 class ObservationPart:
@@ -51,7 +51,7 @@ def build_parts(config: ObservationConfig) -> tuple[ObservationPart, ...]:
 
 
 def _build_part(described: OwnClass) -> ObservationPart:
-    """Build a part and compute the features of two cars: numpy would stretch a column to those that are missing."""
+    """Build a part and check its features for two cars: NumPy would broadcast a single column over missing ones."""
     part, what = (
         build_own(described, "observation.target", ObservationPart),
         f"observation.target={described.target}",
@@ -79,7 +79,7 @@ def feature_names(config: ObservationConfig) -> tuple[str, ...]:
 
 
 def observation_shape(config: ObservationConfig) -> ObservationShape:
-    """Return the shape of what is observed.
+    """Return the shape of the observation.
 
     Raises:
         BadInput: one of the user's own parts cannot be used.
@@ -152,7 +152,7 @@ class Features:
             track_index: index of each car's track, (N,).
             steering_deg: last commanded steering (N,).
             commanded_mps: last commanded speed (N,).
-            others: what is observed of the next boxes and bots, (N, len(OTHERS) * next_objects); None: there are none.
+            others: features of the next boxes and bots, (N, len(OTHERS) * next_objects); None: there are none.
         """
         config = self._config
         out = np.empty((len(now.front), len(self.names)), np.float32)
@@ -182,7 +182,7 @@ class Features:
 
 
 class _Scales(NamedTuple):
-    """What features are divided by."""
+    """Divisors that scale the features."""
 
     speed_mps: float
     yaw_rate_radps: float
@@ -192,7 +192,7 @@ class _Scales(NamedTuple):
 
 
 class _Observed(NamedTuple):
-    """What features are made of; arrays as in `Measures` and `Features.compute`."""
+    """Inputs of the features; arrays as in `Measures` and `Features.compute`."""
 
     front: np.ndarray
     yaw_rad: np.ndarray

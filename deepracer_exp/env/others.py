@@ -1,4 +1,4 @@
-"""Boxes and bots in a race: where they begin, whom a crash is blamed on, and what cars and reward functions see."""
+"""Boxes and bots in a race: their placement, who is at fault in a crash, and what cars and reward functions see."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -23,20 +23,21 @@ from .state import Floats, Measures, checked_array
 from .trace import STATUS_CODE
 
 NEAR_M = 1.0
-"""Along the lap: a car that would start nearer to another than this starts in the other lane."""
+"""Distance along the lap within which a car that would start near a box or bot starts in the other lane."""
 BEHIND_BOX_M = 1.0
-"""A car that has run into a box is put back so far before it."""
+"""Distance before a box at which a car that has run into it continues."""
 BESIDE_M = 0.6
-"""An other counts as ahead until its origin is so far behind the car's front, so that the rear has passed it, too."""
+"""A box or bot counts as ahead until its origin is this far behind the car's front: until the rear has passed it,
+too."""
 _SIZE_M = {False: (0.40, 0.30, 0.25), True: (0.324, 0.188, 0.211)}
 """Length, width and height of boxes and, True, bots (deepracer-simapp, models/box_obstacle and models/bot_car)."""
 _COLOR = {False: (123, 97, 79), True: (40, 40, 40)}
-"""Red, green and blue of the same."""
+"""Red, green and blue of boxes and, True, bots."""
 _GIVES_WAY = np.isin(
     np.arange(len(STATUS_CODE)),
     [STATUS_CODE[status] for status in ("in_progress", "off_track", "immobilized", "reversed")],
 )
-"""Statuses that a crash takes the place of; the end of a lap and of the time come first."""
+"""Statuses that a crash replaces; the end of a lap and of the time have priority."""
 
 
 class RaceOthers:
@@ -227,7 +228,7 @@ class RaceOthers:
         self.others.place(ids, rules.track_index[ids], places_m, lanes, seeds)
 
     def _episode_seeds(self, ids: Ids) -> NDArray[np.uint64]:
-        """Return a number for the cars `ids` that their seed, number and episode decide alone, (n,)."""
+        """Return the seed of the episodes of the cars `ids`, which depends only on seed, car and episode, (n,)."""
         return np.asarray(episode_seeds(self._keys[ids], self._rules.episode[ids]))
 
     def _beside(self, ids: Ids, pose: Pose, ndist: Floats, checked: Bools) -> Pose:
@@ -253,7 +254,7 @@ class RaceOthers:
         return pose
 
     def _other_lane(self, track_index: Ids, offset_m: Floats) -> NDArray[np.int64]:
-        """Return the lane on the other side of the centre line than something at these offsets, (n,)."""
+        """Return the lane across the centre line from these offsets, (n,)."""
         return np.where((offset_m > 0) == self._inner_is_left[track_index], OUTER, INNER)
 
     def _who_is_behind(self, has_hit: Bools, hit: NDArray[np.int64], progress: Floats) -> tuple[Bools, Bools]:
@@ -273,7 +274,7 @@ class RaceOthers:
         return behind, ahead
 
     def _ahead_percent(self, own_percent: Floats, percent: Floats) -> Floats:
-        """Return by how much of the lap cars are ahead of others, both counted from waypoint 0, (n,)."""
+        """Return the lead of cars over others as a share of the lap, both counted from waypoint 0, (n,)."""
         return own_percent - percent
 
 
@@ -291,5 +292,5 @@ def with_crashes(status: NDArray[np.int64], has_hit: Bools, at_fault: Bools) -> 
 
 
 def around(away_m: Floats, length_m: Floats) -> Floats:
-    """Return distances along a lap the shorter way round."""
+    """Return distances along a lap in the shorter direction."""
     return np.mod(away_m + 0.5 * length_m, length_m) - 0.5 * length_m

@@ -23,7 +23,8 @@ _FIRST_QUANTITIES, _FIRST_MATERIALS, _DRAWN_MATERIALS = 10, 8, 12
 and the looks of others were added after the objects, which draw a varying number of values, and so have streams of
 their own."""
 _FACTOR_OF = [MATERIALS.index(name.removeprefix("far_").replace("high", "low")) for name in MATERIALS]
-"""Whose colour factor a material has: farther ahead a line keeps its colour, and opposite walls have the same."""
+"""Material whose colour factor each material shares: a line keeps its colour farther ahead, and opposite walls
+match."""
 _MIDDLE = 127.5
 _SPOT_SIZE = (0.1, 0.5)
 """Standard deviation of a shadow or spot of light, as a share of the picture's width."""

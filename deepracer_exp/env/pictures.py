@@ -1,4 +1,4 @@
-"""The pictures of an observation: what each car's camera sees now, and saw before."""
+"""The pictures of an observation: each car's present and earlier camera frames."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -24,7 +24,7 @@ GREY = np.array([0.299, 0.587, 0.114], np.float32)
 """Weights of red, green and blue in the service's grey (ITU-R BT.601; deepracer-simapp turns RGB into luminance)."""
 _WALLS = ("wall_low_x", "wall_low_y", "wall_high_x", "wall_high_y")
 _FRAMES_AT_ONCE, _PICTURES_AT_ONCE = 16, 256
-"""Frames of the physical car's camera, and pictures of the simulator's, that one thread takes at once: 5 MB in grey."""
+"""Frames of the physical car's camera, and pictures of the simulator's, that a thread renders at once: 5 MB in grey."""
 
 Pixels = NDArray[np.uint8]
 

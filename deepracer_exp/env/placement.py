@@ -1,4 +1,4 @@
-"""The others of an episode: placed at random, written beside the trace, and their poses rebuilt from that."""
+"""Boxes, bots and rival of an episode: drawn at random, recorded beside the trace, and replayed from there."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -50,8 +50,8 @@ _COLUMNS: tuple[tuple[str, pa.DataType, str], ...] = (
         pa.list_(pa.float32()),
         "m, origin of the rival at each of its rows; empty without a rival",
     ),
-    ("rival_y_m", pa.list_(pa.float32()), "m, of the same"),
-    ("rival_yaw_deg", pa.list_(pa.float32()), "degrees, of the same"),
+    ("rival_y_m", pa.list_(pa.float32()), "m, y of that origin"),
+    ("rival_yaw_deg", pa.list_(pa.float32()), "degrees, yaw of that rival"),
 )
 SCHEMA = pa.schema([pa.field(name, kind, metadata={"unit": unit}) for name, kind, unit in _COLUMNS])
 """One row for each episode that drove in an iteration."""
@@ -79,7 +79,7 @@ class PlacedOthers:
 
     race: RaceConfig
     episodes: Mapping[bool, Mapping[int, Placement]]
-    """By whether the track is driven reversed, and the episode's number."""
+    """Placements by direction (whether the track is driven reversed) and episode number."""
     period_s: float
     """Simulated seconds of a control step."""
 
@@ -117,7 +117,7 @@ def draw_placements(
 
 
 def placements_table(setup: RaceSetup, rows: NDArray[np.float64], extra: NDArray[np.float64]) -> pa.Table:
-    """Return what is written of the others of a batch, with the columns of `SCHEMA`.
+    """Return the table of a batch's boxes, bots and rivals, with the columns of `SCHEMA`.
 
     Placements are drawn again from the streams of their cars, as in the processes that drove them.
 
@@ -164,7 +164,7 @@ def placements_table(setup: RaceSetup, rows: NDArray[np.float64], extra: NDArray
 
 
 def read_placements(table: pa.Table) -> dict[bool, dict[int, Placement]]:
-    """Return the others of each episode of written tables, which are in the order of iterations.
+    """Return the placements of each episode from tables in the order of iterations.
 
     The keys are whether the track is driven reversed, and the episode's number.
     """
@@ -201,7 +201,7 @@ def _lists(offsets: NDArray[np.intp], values: NDArray) -> pa.Array:
 
 
 def _parts(column: pa.ChunkedArray) -> list[NDArray[np.float32]]:
-    """Return the entries of a column of lists, of which some may be null."""
+    """Return the entries of a column of lists, some of which may be null."""
     filled = column.combine_chunks()
     values = filled.flatten().to_numpy(zero_copy_only=False)
     lengths = filled.value_lengths().fill_null(0).to_numpy(zero_copy_only=False)
@@ -232,8 +232,8 @@ def rebuild_poses(
     bots' poses of the step before, as on the service.
 
     Args:
-        race: among whom the car drove.
-        track: on which, in its direction.
+        race: with the boxes and bots around the car.
+        track: in the direction driven.
         placements: of each episode.
         period_s: simulated seconds of a control step.
         episode: of each row, the index in `placements`, (n,).
@@ -286,8 +286,8 @@ def _rival_poses(
 def _least_m(race: RaceConfig, length_m: Floats, episode: NDArray[np.int64]) -> Floats:
     """Return the least distances between boxes in episodes, (n,).
 
-    The service takes its number for per cent of the lap, and applies that to its own result at every placement, of
-    which there is one more than episodes (deepracer-simapp, agent_ctrl/obstacles_agent_ctrl.py).
+    The service reads its distance as per cent of the lap, and scales its own result again at every placement, of which
+    there is one more than episodes (deepracer-simapp, agent_ctrl/obstacles_agent_ctrl.py).
     """
     least = race.boxes.min_distance_m
     if race.quirks == "fixed":

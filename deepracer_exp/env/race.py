@@ -33,7 +33,7 @@ _KEPT = (
     *("_return", "_steering_deg", "_commanded_mps"),
     *("observation", "pixels", "reward", "terminated", "truncated", "trace"),
 )
-"""A race's own arrays that belong in a checkpoint."""
+"""The race's arrays that a checkpoint holds."""
 
 
 class NonFinite(RunFailed):
@@ -58,7 +58,7 @@ class Race:
         lidar: what the LIDARs last read, (N, size), float32; (N, 0) where there is none.
         reward: of the last step, (N,), float64.
         terminated: the last step ended the episode, (N,), bool.
-        truncated: the last step cut the drive off, see `StepResult`, (N,), bool.
+        truncated: the last step cut the episode off, see `StepResult`, (N,), bool.
         trace: one row per car for the last step, columns `env.trace.PACKED_COLUMNS`, among others `OTHERS_PACKED`, and
             against a rival `RIVAL_PACKED`, (N, C), float64.
         others: the boxes and bots on the road; None: the cars are alone.
@@ -76,10 +76,10 @@ class Race:
         """Build the cars; `reset` puts them on the track.
 
         Args:
-            setup: what the experiment chose.
+            setup: of the experiment.
             n_cars: cars in this batch.
             threads: of physics and cameras; 0 means one per core.
-            first_car: number of the first car over all processes, which its random stream and starts depend on.
+            first_car: number of the first car over all processes; it decides random streams and starts.
             prints: where `print` of a reward function goes; None: nowhere.
             randomizations: of each car, (N,); None: the setup's for all.
         """
@@ -219,12 +219,12 @@ class Race:
         self._batch.place(ids, pose.x, pose.y, pose.yaw_rad)
 
     def _begin(self, ids: np.ndarray) -> None:
-        """Draw what differs from episode to episode."""
+        """Draw the randomization of new episodes."""
         self.randomization.begin(ids, self.rules.episode[ids])
         self._draw_again(ids)
 
     def _draw_again(self, ids: np.ndarray) -> None:
-        """Draw what the episode's number decides: how far cars are the physical one, what cameras and LIDARs see."""
+        """Draw everything that the episode's number decides: physical car, cameras, LIDARs."""
         episode = self.rules.episode[ids]
         self._real_car.begin(ids, episode)
         if self._varied is not None:
@@ -318,11 +318,11 @@ class Race:
             raise self._lost_car(error, action) from error
 
     def _commands(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the steering in degrees and the speed in m/s that actions mean, (N,) each."""
+        """Convert actions to steering in degrees and speed in m/s, (N,) each."""
         return self.setup.actions.commands(action)
 
     def _look(self, action: np.ndarray) -> None:
-        """Observe where the cars have come to by an action; errors as for `step`."""
+        """Compute the observation after the action; errors as for `step`."""
         self._observe()
         self._require_finite("observation", self.observation, self.feature_names, action)
 
@@ -447,7 +447,7 @@ class Race:
         state = self._batch.read(ids)
         everyone = len(ids) == self.n_cars
         started = self.rules.measure(state) if everyone else self.rules.measure_some(ids, state)
-        # The terminal observation has been handed out; it must stay as it was.
+        # The caller holds the terminal observation: it must not change.
         self.observation = self.observation.copy()
         self.observation[ids] = self.randomization.disturb_first_observation(
             ids, self._features_of(started, ids)

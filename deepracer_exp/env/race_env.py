@@ -58,11 +58,11 @@ class RaceEnv(EnvBase):
 
     @property
     def seen(self) -> dict[str, np.ndarray]:
-        """What policies may read now, by key."""
+        """The present observation, by key."""
         return self.race.seen
 
     def drive(self, action: np.ndarray) -> dict[str, np.ndarray]:
-        """Step all cars and return what a step has under `next`, by key; `trace` is valid until the next step.
+        """Step all cars and return the entries under `next`, by key; `trace` is valid until the next step.
 
         Actions are as for `Race.step`, which also says what is raised.
         """

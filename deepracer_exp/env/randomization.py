@@ -32,7 +32,7 @@ _BLOCK = 128
 
 
 class Purpose(IntEnum):
-    """The purpose of random numbers: each has its own streams, so that none shifts another."""
+    """Purposes of random numbers: each has its own streams, so that its draws never shift those of another."""
 
     ACTION = 0
     OBSERVATION = 1
@@ -109,7 +109,7 @@ class StepNoise:
 
 
 def of_each_car(configs: Sequence[RandomizationConfig], cars: Sequence[int]) -> list[RandomizationConfig]:
-    """Return each car's randomization, (N,): that of its config, or none for cars outside of its `car_share`.
+    """Return each car's randomization, (N,): the configured one, or none for cars outside `car_share`.
 
     `cars` are their numbers over all processes. Multiples of the golden ratio, modulo 1, are spread evenly over all
     cars, and over every second or third of them (Weyl's theorem), so that on each of several tracks about the same
@@ -256,7 +256,7 @@ class Randomization:
             steering_at, speed_at = sent - self._late_steps
             self._commands[steps % slots, self._rows] = np.stack([steering_deg, speed_mps], axis=1)
             steering_deg = self._commands[steering_at % slots, self._rows, 0]
-            # Earlier commands are void, and the speed may arrive before the steering.
+            # Commands of the last episode are void, and the speed may arrive before the steering.
             steering_deg = np.where(steering_at > self._no_command_until, steering_deg, 0.0)
             speed_mps = self._commands[speed_at % slots, self._rows, 1]
             moving = speed_at > self._no_command_until

@@ -1,4 +1,4 @@
-"""The physical car: what it can run, and how it sees and acts."""
+"""The physical car: the policies it can run, its camera, steering and motor."""
 
 import io
 import math
@@ -36,11 +36,11 @@ Floats = NDArray[np.float64]
 
 
 def car_refusals(experiment: Experiment) -> list[str]:
-    """Return why the car could not run a policy of this experiment, or would show it something else.
+    """Return why the car cannot run a policy of this experiment, or would feed it another observation.
 
-    Each reason is a line with key, value and what would be accepted; the list is empty if the car can. Sources:
-    deepracer-custom-car 2.1.9.9, sensor_fusion_pkg and inference_pkg (one grey picture a frame, or two of a stereo
-    pair), webserver_pkg (LIDAR), deepracer_navigation_pkg (ranges of continuous actions).
+    Each reason is a line with key, value and what would be accepted; the list is empty for a policy that it can run.
+    Sources: deepracer-custom-car 2.1.9.9, sensor_fusion_pkg and inference_pkg (one grey picture a frame, or two of a
+    stereo pair), webserver_pkg (LIDAR), deepracer_navigation_pkg (ranges of continuous actions).
 
     Raises:
         BadInput: a file of the action space is missing or malformed.
@@ -83,10 +83,10 @@ def car_refusals(experiment: Experiment) -> list[str]:
 
 
 def require_car(experiment: Experiment, key: str = "evaluation.real_car") -> None:
-    """Refuse a policy that the car could not run, with the first of `car_refusals`; `key` asked for the car.
+    """Refuse a policy that the car cannot run, with the first of `car_refusals`; `key` asked for the car.
 
     Raises:
-        BadInput: it could not.
+        BadInput: the car cannot run it.
     """
     for refusal in car_refusals(experiment):
         raise BadInput(key, f"the car cannot run this policy: {refusal}")
@@ -95,7 +95,7 @@ def require_car(experiment: Experiment, key: str = "evaluation.real_car") -> Non
 def as_the_car(setup: "RaceSetup", real_car: RealCarConfig) -> "RaceSetup":
     """Return a race in which cars see and act as the physical car does.
 
-    Its physics steps are not longer than before, and the episode's rules hold for the same times.
+    Its physics steps are no longer than before, and the rules' limits stay the same in seconds.
     """
     setup = replace(setup, real_car=real_car)
     if real_car.timing is None:
@@ -125,13 +125,13 @@ def as_the_car(setup: "RaceSetup", real_car: RealCarConfig) -> "RaceSetup":
 
 
 def split_delay(delay_s: Floats, period_s: float) -> tuple[NDArray[np.int64], Floats]:
-    """Return delays as whole control periods, which the queue of commands takes, and the seconds left for the car."""
+    """Split delays into whole control periods, for the queue of commands, and the remaining seconds, for the car."""
     whole, rest_s = np.divmod(delay_s, period_s)
     return whole.astype(np.int64), rest_s
 
 
 class Servos:
-    """Steering servo and motor of N cars: what they make of commands.
+    """Steering servo and motor of N cars: their response to commands.
 
     The speed is taken to be proportional to the throttle; nothing is published on how the car's motor answers it.
     """
@@ -197,7 +197,7 @@ def car_pictures(frames: NDArray[np.uint8], jpeg_quality: ArrayLike) -> NDArray[
 
 
 def check_car(experiment: Experiment) -> None:
-    """Refuse a policy that the car could not load, or to which it would show something else.
+    """Refuse a policy that the car cannot load, or to which it would feed another observation.
 
     Raises:
         BadInput: naming the key and what would be accepted.

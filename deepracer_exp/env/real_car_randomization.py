@@ -1,4 +1,4 @@
-"""How much of the physical car the cars of each episode have: drawn around it, or all of it for an evaluation."""
+"""Randomization towards the physical car: drawn for each episode of a training, complete in an evaluation."""
 
 from collections.abc import Sequence
 
@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 
 _QUALITY, _LATENCY, _LOCK, _CURVE = range(4)
 _OFF = ((AS_SIMULATED, AS_SIMULATED), (0.0, 0.0), (0.0, 0.0), (0.0, 0.0))
-"""Ranges that leave a car as the simulator has it, in the order of the draws."""
+"""Ranges of the simulator's unchanged car, in the order of the draws."""
 
 
 class RealCarRandomization:
@@ -30,7 +30,7 @@ class RealCarRandomization:
         full_lock_deg: angle that the largest one of the action space becomes; 0: controls as simulated, (N,).
         throttle_curve: share of the physical car's throttle curve in that of each car, (N,).
         late_steps: whole control steps by which steering and speed commands arrive late, (2, N), int64.
-        most_late_steps: the most of these that can be drawn.
+        most_late_steps: the largest delay that can be drawn.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""The other car of a race head to head, as each of the two cars meets it."""
+"""The opponent in a head-to-head race, from the view of either car."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -22,7 +22,7 @@ _KEPT = ("speed_mps", "untouchable")
 
 
 class _OtherCar(Others):
-    """The boxes around each of N cars, and last another car, which is driven elsewhere and shown here.
+    """The boxes around each of N cars, and last its opponent, whose pose the opponent's own race sets.
 
     Attributes:
         speed_mps: how fast this car drives, (N,).
@@ -79,14 +79,15 @@ class RaceRival(RaceOthers):
 
     @property
     def serving(self) -> Bools:
-        """Return which cars will be held at the next control step, (N,)."""
+        """Return which cars still serve a penalty at the next control step, (N,)."""
         return np.asarray(self._held_until > self._rules.steps)
 
     def begin(self, ids: Ids, pose: Pose, evaluated: bool) -> Pose:
         """Return where the cars start: one at its place in the outer lane, the other behind it in the inner one.
 
         The finish line of both is the place of the car in front. Who starts there is drawn, and in an evaluation
-        alternates from trial to trial. A car that would start near a box starts in the other lane, where need be both.
+        alternates from trial to trial. A car that would start near a box starts in the other lane; this may move both
+        cars.
         """
         self._held_until[ids] = 0
         rules = self._rules
@@ -100,11 +101,11 @@ class RaceRival(RaceOthers):
         return self._among_others(ids, pose, ndist, evaluated) if self._race.boxes.count else pose
 
     def show(self, ids: Ids, cars: CarState, serving: Bools) -> None:
-        """Show the cars `ids` where their others are.
+        """Update the opponents of the cars `ids`.
 
         Args:
             ids: indices of the cars, (n,).
-            cars: all others, (N,) each.
+            cars: all opponents, (N,) each.
             serving: which of these serve a penalty, (N,).
         """
         rules, car = self._rules, self.others

@@ -1,4 +1,4 @@
-"""The passes of the rules over the cars, compiled; `rules` says what each rule is."""
+"""Compiled loops that apply the rules to all cars; `rules` defines each rule."""
 
 import math
 from typing import Any, NamedTuple
@@ -37,7 +37,7 @@ def lap_progress(ndist, start_ndist, previous):  # type: ignore[no-untyped-def]
 
 
 class Judged(NamedTuple):
-    """What the rules judge of a control step, of one car or in arrays with a row per car; see `EpisodeRules.apply`."""
+    """Inputs of the rules at a control step, of one car or in arrays with a row per car; see `EpisodeRules.apply`."""
 
     steps: Any
     progress: Any
@@ -230,7 +230,7 @@ def step_cars(places, episodes, rules, closed, road):  # type: ignore[no-untyped
 
 @compiled
 def endings_of(status, track_index, closed, lap_terminates, endings):  # type: ignore[no-untyped-def]
-    """Return which statuses terminate episodes, and which cut them off, (N,) each; `endings` are those of `rules`."""
+    """Return which statuses terminate and which truncate episodes, (N,) each; `endings` are those of `rules`."""
     in_progress, pause, lap_complete, time_up = endings
     terminated, truncated = np.empty(len(status), np.bool_), np.empty(len(status), np.bool_)
     for car in range(len(status)):

@@ -52,7 +52,7 @@ _CODES = tuple(
     )
 )
 _ENDINGS = tuple(STATUS_CODE[status] for status in ("in_progress", "pause", "lap_complete", "time_up"))
-"""Codes that compiled passes are given: what they have compiled is kept where a change of the codes is not noticed."""
+"""Codes passed to compiled loops as arguments: numba's cache would not notice a change of constants."""
 
 
 def lap_clock_s(steps: ArrayLike, period_s: float) -> Floats:
@@ -139,11 +139,12 @@ class StepResult:
     """Codes of `env.trace.STATUS_CODE`."""
     terminated: Bools
     truncated: Bools
-    """Whether the drive was cut off where it could continue: at `episode.max_steps`, or at the end of a closed lap."""
+    """Whether the episode was cut off although the car could drive on: at `episode.max_steps`, or at the end of a
+    closed lap."""
 
 
 class RaceRules:
-    """Applies the rules to the poses of N cars step by step, whether physics, a recording or a caller gives them.
+    """Applies the rules to the poses of N cars step by step, from physics, a recording or any caller.
 
     A step is one call of `measure` and one of `apply`. The first step of an episode is the prepare step.
 
@@ -154,7 +155,7 @@ class RaceRules:
         clock_steps: control steps since `restart`, (N,), int64.
         start_ndist: where the episodes began, as shares of the lap, (N,).
         tracks: each course in each of its directions, as one batch.
-        track_params: the params of a reward function that are constant on each of these.
+        track_params: a reward function's constant params of each of these.
         course: index of each car's course in `setup.courses`, (N,).
         track_index: index of its track in `tracks` and `track_params`, (N,).
         episodes: these arrays and more, for compiled code, which changes them in place: none may be replaced.
@@ -297,7 +298,7 @@ class RaceRules:
         return StepResult(now, *step_cars(places, self.episodes, self._rules, closed, road))
 
     def ends(self, status: NDArray[np.int64]) -> tuple[Bools, Bools]:
-        """Return which status codes of all cars, (N,), terminate their episodes, and which cut them off, (N,) each."""
+        """Return which status codes of all cars, (N,), terminate and which truncate their episodes, (N,) each."""
         lap_terminates, closed = self._rules.lap_terminates, self.tracks.closed
         terminated, truncated = endings_of(status, self.track_index, closed, lap_terminates, _ENDINGS)
         return terminated, truncated

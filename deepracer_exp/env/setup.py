@@ -25,11 +25,11 @@ from .observation import ObservationPart, build_parts
 
 @dataclass(frozen=True, kw_only=True)
 class Course:
-    """A track in the directions in which it is driven."""
+    """A track with its directions of driving."""
 
     name: str
     weight: float
-    """Share of the cars that drive here, relative to the other courses."""
+    """Weight of the course in the distribution of cars."""
     tracks: tuple[Track, ...]
     """One per direction; two directions alternate from episode to episode."""
 
@@ -58,9 +58,9 @@ def build_courses(
 def deal(weights: Sequence[float]) -> Iterator[int]:
     """Yield the index of the course of car 0, 1, 2, ... without end.
 
-    Each of the first cars takes another course; every further car takes the course that lacks most of its share by
-    weight. So any long enough range of cars covers all courses by their weights, and a car's course does not depend
-    on the number of cars.
+    Each of the first cars takes another course; every further car takes the course that is furthest below its share by
+    weight. So any long enough range of cars covers the courses in proportion to their weights, and a car's course does
+    not depend on the number of cars.
     """
     total = sum(weights)
     count = [0] * len(weights)
@@ -95,7 +95,7 @@ class RaceSetup:
     """Boxes and bots around every car; None: it is alone."""
     real_car: RealCarConfig | None = None
     late_steps: tuple[int, int] = (0, 0)
-    """Control steps by which steering and speed commands reach every car later than drawn."""
+    """Control steps that steering and speed commands take beyond the drawn delay, for every car."""
 
     @property
     def track(self) -> Track:

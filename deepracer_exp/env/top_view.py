@@ -28,7 +28,7 @@ class TopView:
         self._tracks: dict[int, tuple[Image.Image, NDArray[np.float64], float]] = {}
 
     def picture(self, car: int) -> NDArray[np.uint8]:
-        """Return what is seen of the car with this index, (height, width, 3), both even, as video codecs want them."""
+        """Return the picture of the car with this index, (height, width, 3), height and width even for video codecs."""
         race = self._race
         course = int(race.rules.course[car])
         if course not in self._tracks:

@@ -13,7 +13,7 @@ from .trace import PACKED_COLUMNS, RANDOMIZED
 
 
 def row_dtype(extra: Sequence[str] = ()) -> np.dtype[np.void]:
-    """Return the record that a packed row is, with these columns after the others.
+    """Return the record type of a packed row, with these columns after the others.
 
     Its fields are those of `PACKED_COLUMNS`; the columns of `RANDOMIZED`, which are adjacent, are one, `randomized`.
     """
@@ -27,7 +27,7 @@ def row_dtype(extra: Sequence[str] = ()) -> np.dtype[np.void]:
 
 
 class Driven(NamedTuple):
-    """What a control step was: arrays with a row per car."""
+    """Values of a control step: arrays with a row per car."""
 
     front: np.ndarray
     """(N, 2)."""
@@ -53,10 +53,10 @@ class Driven(NamedTuple):
 
 
 class Lengths(NamedTuple):
-    """What all steps have in common."""
+    """Constants of all steps."""
 
     waypoints: np.ndarray
-    """Waypoints as in `Tracks.waypoints`, as is `first_waypoint`."""
+    """Waypoints as in `Tracks.waypoints`; `first_waypoint` likewise."""
     first_waypoint: np.ndarray
     length_m: np.ndarray
     """Lengths of the tracks, (W,)."""

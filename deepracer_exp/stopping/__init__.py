@@ -1,1 +1,1 @@
-"""When a training has nothing more to gain: the rules that end a run, and by which a report judges it."""
+"""Stopping rules: they end a run whose training has nothing more to gain, and a report judges it by them."""

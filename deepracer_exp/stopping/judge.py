@@ -32,7 +32,7 @@ LOG_RULE = ConvergedRule(
 )
 """The values of `conf/stopping/entropy.yaml`, with the warm-up and patience that suit the shorter logs of others."""
 PATIENCE_SHARE = 0.2
-"""Share of all iterations of such a log that must be without growth."""
+"""Share of the iterations of such a log that count as patience."""
 _WINDOW = 3
 """Iterations of the moving averages."""
 POOR = 50.0
@@ -44,7 +44,7 @@ _FEWEST_EVALUATIONS = 6
 
 @dataclass(frozen=True, kw_only=True)
 class Convergence:
-    """Since when nothing has grown."""
+    """Where a training converged."""
 
     iteration: int | None
     """Iteration at which it converged; None if it has not."""
@@ -97,7 +97,7 @@ def convergence(
 
 
 def iterations_needed(iterations: "pd.DataFrame", stopping: Mapping[str, Any] | None = None) -> int:
-    """Return from how many iterations with an episode on `convergence` says something; arguments as there."""
+    """Return the number of iterations with an episode that `convergence` needs; arguments as there."""
     return _rule_for(iterations[iterations["episodes"] > 0], stopping).patience + _WINDOW
 
 
@@ -175,7 +175,7 @@ def _only(
 
 
 def _rows(iterations: "pd.DataFrame") -> Iterator[Row]:
-    """Return iterations as the rows of a training, as far as the rules of trends look at them."""
+    """Convert iterations to rows of metrics.jsonl, with the columns that the rules of trends read."""
     laps = (iterations["lap_share"] * iterations["episodes"]).fillna(0.0).cumsum()
     reliable = iterations["eval_lap_share"] >= RELIABLE
     table = {
@@ -193,7 +193,7 @@ def _rows(iterations: "pd.DataFrame") -> Iterator[Row]:
 
 @cache
 def _stopping_adapter() -> "TypeAdapter[StoppingConfig]":
-    # Once a process: to build it takes 30 ms, and a page asks four times.
+    # Cached: composing it takes 30 ms, and a page needs it four times.
     return TypeAdapter(StoppingConfig)
 
 

@@ -32,7 +32,7 @@ _GROWTH = ("completion", "mean_return", "laps_per_1000_steps")
 _LAP_SPEED = "evaluated_laps_per_s"
 _STEPS = 1000  # control steps per which laps are counted, because iterations differ in length
 UNDECIDED = {"stopping.rule": "none", "stopping.stopped_early": "false"}
-"""Tags of a run that is resumed after a rule had ended it; the values by which it did stay beside them."""
+"""Tags of a run that is resumed after a rule had ended it; those with the rule's values stay."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +49,7 @@ class Decision:
     thresholds: dict[str, Any] = field(default_factory=dict)
     """The keys of the rule."""
     stopped_early: bool = False
-    """Whether more training would have led nowhere, and the result is of no use."""
+    """Whether more training would not have helped, and the result is of no use."""
 
     def __str__(self) -> str:
         """Return rule and reason, e.g. ``reliable: 94% of the last 50 episodes completed the lap``."""
@@ -57,15 +57,15 @@ class Decision:
 
     @property
     def ending(self) -> Ending:
-        """How a run ends by it."""
+        """The run's ending under this decision."""
         return Ending.by_rule(self.rule, self.why, STOPPED_EARLY if self.stopped_early else FINISHED)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it for summary.json."""
+        """Return the decision for summary.json."""
         return asdict(self)
 
     def tags(self) -> dict[str, str]:
-        """Return it as tags of a run."""
+        """Return the decision as tags of a run."""
         numbers = [("value", self.values), ("threshold", self.thresholds)]
         return {
             "stopping.rule": self.rule,
@@ -81,8 +81,7 @@ class Decision:
 def entropy_share(entropy: float, at_start: float, action_count: int | None) -> float:
     """Return a policy's entropy as a share.
 
-    Entropies are in nats; that at the start of the run is looked at for a continuous policy only, whose `action_count`
-    is None.
+    Entropies are in nats; the one at the start is used only for a continuous policy, whose `action_count` is None.
 
     Returns:
         For a discrete policy its entropy over that of a uniform choice, log(n): 0 to 1. A continuous policy's entropy
@@ -95,12 +94,12 @@ def entropy_share(entropy: float, at_start: float, action_count: int | None) -> 
 
 
 def entropy_over_target(entropy: float, target: float, action_count: int | None) -> float:
-    """Return the entropy of a policy that is led to a target, as SAC's is by its temperature, as a share of it.
+    """Return entropy as a share of its target, for a policy such as SAC's whose temperature steers it there.
 
     Both are in nats.
 
     Returns:
-        1 at the target; of a continuous policy the ratio of the spreads, as in `entropy_share`.
+        1 at the target; for a continuous policy the ratio of spreads, as in `entropy_share`.
     """
     if action_count is None:
         return entropy_share(entropy, target, None)
@@ -124,7 +123,7 @@ class ReliableRule(StoppingRule):
     def __init__(self, config: ReliableStopping):
         self._config = config
         self._evaluated: deque[tuple[int, int, float]] = deque(maxlen=config.evaluations)
-        """Complete laps of the last evaluations on the usual conditions, those tried, and the completion on held-out
+        """Complete and attempted laps of the last evaluations under the usual conditions, and completion under held-out
         ones."""
 
     def observe(self, row: Row) -> Decision | None:
@@ -160,7 +159,7 @@ class ReliableRule(StoppingRule):
 
 
 class TrendRule(StoppingRule):
-    """The rules `plateau` and `entropy`, which look at moving averages."""
+    """The rules `plateau` and `entropy`, which read moving averages."""
 
     def __init__(self, config: PlateauStopping | EntropyStopping, action_count: int | None):
         """Set up the rule.

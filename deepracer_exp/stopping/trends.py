@@ -1,4 +1,4 @@
-"""Trends over the rows of a run: moving averages, and what the parts of `stopping=entropy` read in them."""
+"""Trends over the rows of a run: moving averages, and the parts of `stopping=entropy`, which read them."""
 
 import math
 
@@ -9,7 +9,7 @@ Reason = tuple[str, dict[str, float]]
 
 
 class Average:
-    """A moving average over the last known values of a column; it stays where a row has none."""
+    """A moving average over the last known values of a column; rows without a value leave it unchanged."""
 
     def __init__(self, window: int):
         self._window = window
@@ -36,7 +36,7 @@ class Average:
         return len(self._averages) > patience and self._averages[-patience - 1] is not None
 
     def is_fresh(self, rows: int) -> bool:
-        """Return whether the newest average is one of values of the last rows alone."""
+        """Return whether the newest average contains only values of the last rows."""
         return sum(self._has_value[-rows:]) >= self._window
 
     @property
@@ -72,7 +72,7 @@ class Average:
 
 
 def collapsed(rule: CollapsedRule, entropy: Average, completion: Average) -> Reason | None:
-    """Return why a policy that has become almost deterministic and drives badly should end."""
+    """Return why a run whose policy is almost deterministic and drives badly should end."""
     highest, best = max(entropy.last(rule.patience)), max(completion.last(rule.patience))
     if highest >= rule.entropy_floor or best >= rule.completion_poor:
         return None
@@ -83,9 +83,9 @@ def collapsed(rule: CollapsedRule, entropy: Average, completion: Average) -> Rea
 def not_learning(
     rule: NotLearningRule, entropy: Average, completion: Average, is_led: bool = False
 ) -> Reason | None:
-    """Return why a policy that has hardly changed since the start should end.
+    """Return why a run whose policy has hardly changed since the start should end.
 
-    With `is_led` its entropy follows a target, whether it learns or not, so that its completion alone decides.
+    With `is_led` its entropy follows a target whether it learns or not, so only its completion decides.
     """
     lowest, best = min(entropy.last(rule.patience)), max(completion.last(rule.patience))
     start = completion.first
@@ -101,7 +101,7 @@ def not_learning(
 
 
 def overfits(rule: OverfittingRule, held_out: Average, returns: Average, speed: Average) -> Reason | None:
-    """Return why a policy that completes less on held-out conditions, for laps hardly faster, should end.
+    """Return why a run should end whose policy completes less under held-out conditions for hardly faster laps.
 
     `speed` as in `laps_slower`; where it has no average before the last `patience` rows, the return alone says whether
     the policy still improves.
@@ -123,7 +123,7 @@ def overfits(rule: OverfittingRule, held_out: Average, returns: Average, speed: 
 
 
 def laps_slower(rule: LapsSlowerRule, speed: Average, returns: Average) -> Reason | None:
-    """Return why a policy whose evaluated laps have become slower while its return holds should end.
+    """Return why a run whose evaluated laps have become slower, at an unchanged return, should end.
 
     `speed` is 1 / lap time, 1/s, of evaluations that completed `RELIABLE` of their laps.
     """
