@@ -1,4 +1,4 @@
-"""Processes that end with their owner, the process that started them, however that one dies.
+"""Processes that end with their owner, the process that started them, however it dies.
 
 A worker is killed by the kernel when its parent dies (prctl(2), PR_SET_PDEATHSIG), even one that hangs or is stopped.
 Its parent is the fork server, which dies in the same way with the owner that started it. A thread of the worker waits
@@ -23,7 +23,7 @@ _GIVEN_SAFE_PATH = os.environ.get(_SAFE_PATH)
 
 
 def guard_imports() -> None:
-    """Have no Python that is started from now on import from the working folder.
+    """Keep every Python process started from now on from importing from the working folder.
 
     With `-c` and `-m` Python looks there first: a fork server would import the user's `queue.py` in place of its own.
     """
@@ -31,15 +31,15 @@ def guard_imports() -> None:
 
 
 def given_environment() -> dict[str, str]:
-    """Return the environment without what `guard_imports` has set, for a program of the user's own."""
+    """Return the environment without the changes of `guard_imports`, for a program of the user's own."""
     variables = {} if _GIVEN_SAFE_PATH is None else {_SAFE_PATH: _GIVEN_SAFE_PATH}
     return {name: value for name, value in os.environ.items() if name != _SAFE_PATH} | variables
 
 
 def die_with_parent() -> None:
-    """Have the kernel kill this process once the thread that started it is gone; of no effect but on Linux.
+    """Have the kernel kill this process once the thread that started it is gone; on Linux only.
 
-    So its parent must start it from the main thread.
+    Its parent must therefore start it from the main thread.
     """
     if _IS_LINUX:
         PR_SET_PDEATHSIG = 1

@@ -36,16 +36,16 @@ _ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU, "e
 # A policy that starts almost uniform (or centred) explores evenly; the value head starts at full scale.
 HIDDEN_GAIN, POLICY_GAIN, VALUE_GAIN = math.sqrt(2), 0.01, 1.0
 CRITIC_HIDDEN = (64, 64)
-"""Units of a value network that sees features beside a policy that sees pictures."""
+"""Units of a value network on features, for a policy on pictures."""
 INITIAL_STD = 0.5
 """Initial standard deviation of a continuous policy on a user's network without an attribute `initial_std`."""
 
 
 class PolicyNetworks(nn.Module):
-    """A stochastic policy, beside what its algorithm needs to improve it.
+    """A stochastic policy, with the further networks of its algorithm.
 
     Attributes:
-        trunk: What the policy shares with another network, -> `hidden`; None: it shares nothing.
+        trunk: Layers that the policy shares with another network, -> `hidden`; None: it shares none.
         policy_head: The policy's layers after the trunk; without a trunk, all of them.
     """
 
@@ -55,9 +55,9 @@ class PolicyNetworks(nn.Module):
 
     @property
     def policy(self) -> TensorDictModuleBase:
-        """What collectors drive with: what is seen -> `action` and `action_log_prob`; it shares these parameters.
+        """The policy module of collectors: observation -> `action` and `action_log_prob`; it shares these parameters.
 
-        What is seen is `observation`, or `pixels` and `lidar` where there are such sensors. It samples;
+        It reads `observation`, or `pixels` and `lidar` where there are such sensors. It samples;
         `set_exploration_type(ExplorationType.DETERMINISTIC)` makes it take the likeliest action. A discrete action is
         an int64 index of shape [...], a continuous one two float32 numbers, which the environment clips to -1..1. The
         distribution's parameters are written beside them (`logits`, or `loc` and `scale`).
@@ -66,7 +66,7 @@ class PolicyNetworks(nn.Module):
 
     @property
     def in_keys(self) -> list[str]:
-        """What the networks read."""
+        """Keys that the networks read."""
         raise NotImplementedError
 
 
@@ -90,7 +90,7 @@ class ActorCritic(PolicyNetworks):
 
     @property
     def policy(self) -> TensorDictModuleBase:
-        """As of `PolicyNetworks`; continuous actions are unbounded."""
+        """The policy of `PolicyNetworks`; continuous actions are unbounded."""
         if self.trunk is None:
             return self.policy_head
         policy = ActorValueOperator(self.trunk, self.policy_head, self.value_head).get_policy_operator()
@@ -123,7 +123,7 @@ def build_actor_critic(
         network: Sizes and kind, or a class of the user's own: a `torch.nn.Module` called with the numbers of inputs and
             outputs, once for the policy and once for the value. With a camera the inputs are channels,
             height and width of `pixels`; the number of a LIDAR's readings follows as an argument of its own.
-        observed: What there is to read.
+        observed: The observation to read.
         action_count: Number of discrete actions, or None for the two continuous ones.
         generator: Source of the initial weights; the global random state has no part in them. None: they will be
             replaced.
@@ -146,7 +146,7 @@ def build_actor_critic(
     keys = list(observed.seen) if isinstance(network, CNNConfig) else ["observation"]
 
     def layers(outputs: int | None, gain: float) -> nn.Module:
-        """Build layers for what is seen; without `outputs` the last hidden layer is the output."""
+        """Build layers for the observation; without `outputs` the last hidden layer is the output."""
         net: nn.Module = (
             SensorNet(network, observed, outputs)
             if isinstance(network, CNNConfig)
@@ -204,10 +204,10 @@ def dense(inputs: int, hidden: tuple[int, ...], activation: str, outputs: int | 
 class SensorNet(nn.Module):
     """Convolutions for pictures, layers for a LIDAR, and a perceptron that joins them.
 
-    Called with what there is of pictures, uint8 [..., channels, height, width], and readings, float32 [..., readings];
-    returns float32 [..., outputs]. With pictures, products are in bfloat16 on a GPU, and on processors with
-    instructions for it (updates are 1.7 to 2.4 times as fast with AVX-512 BF16, three times with AMX); pictures are
-    convolved as `convolve` says.
+    Called with pictures, uint8 [..., channels, height, width], or readings, float32 [..., readings], or both; returns
+    float32 [..., outputs]. With pictures, products are in bfloat16 on a GPU, and on processors with instructions for it
+    (updates are 1.7 to 2.4 times as fast with AVX-512 BF16, three times with AMX); pictures are convolved as `convolve`
+    says.
     """
 
     def __init__(
@@ -215,7 +215,7 @@ class SensorNet(nn.Module):
     ) -> None:
         """Build the layers; without `outputs` the last hidden layer is the output.
 
-        With `actions`, so many numbers follow the sensors as the last input and join them, as a critic needs it.
+        With `actions`, that many numbers follow the sensors as the last input and join them, as for a critic.
         """
         super().__init__()
         activation = config.activation
@@ -272,8 +272,8 @@ class SensorNet(nn.Module):
 class Attention(nn.Module):
     """A weighted sum of the places of a column of a picture, [n, channels, height, width] -> [n, channels, 1, width].
 
-    The weights of a column's places sum to 1; columns stay apart, so that the direction of what is seen is kept.
-    Source: deepracer-simapp, `bundle/markov/presets/left_stereo_attention.py`.
+    The weights of a column's places sum to 1; columns stay apart, so that directions are kept. Source:
+    deepracer-simapp, `bundle/markov/presets/left_stereo_attention.py`.
     """
 
     def __init__(self, channels: int, units: int) -> None:

@@ -1,4 +1,4 @@
-"""What every algorithm has: the base class, and what an update reports."""
+"""The base class of algorithms, and the metrics of an update."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -42,7 +42,7 @@ class Algorithm:
 
     Attributes:
         replay: Past steps that it learns from again, saved with the last checkpoint; None: it needs none.
-        threads: That an update of networks of features may use.
+        threads: Number that an update of networks on features may use.
     """
 
     replay: Replay | None = None
@@ -58,11 +58,11 @@ class Algorithm:
         self.networks, self.config, self.schedule = networks, config, schedule
 
     def __str__(self) -> str:
-        """Return its name for the first line of a training."""
+        """Return the algorithm's name for the first line of a training."""
         return type(self).__name__
 
     def rates(self, iteration: int, fraction: float) -> dict[str, float]:
-        """Return what the schedules lead to in the coming update, by its name; arguments as of `update`."""
+        """Return the scheduled values of the coming update, by name; arguments as for `update`."""
         return {"learning rate": self.config.lr * self.schedule.factor(iteration, fraction)}
 
     def update(self, batch: TensorDictBase, iteration: int, fraction: float) -> UpdateMetrics:
@@ -85,7 +85,7 @@ class Algorithm:
         self.networks.load_state_dict(networks.state_dict())
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what a checkpoint holds: tensors and plain values; `networks` is what evaluations read."""
+        """Return the state for a checkpoint: tensors and plain values; evaluations read only `networks`."""
         return {"networks": self.networks.state_dict(), "schedule": self.schedule.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

@@ -29,7 +29,7 @@ def build_networks(
     action_count: int | None,
     generator: torch.Generator | None,
 ) -> PolicyNetworks:
-    """Build the networks that an algorithm trains; arguments and errors as of `build_actor_critic`."""
+    """Build the networks of an algorithm; arguments and errors as for `build_actor_critic`."""
     if isinstance(algorithm, SACConfig):
         return build_soft_actor_critic(network, observed, action_count, generator)
     return build_actor_critic(network, observed, action_count, generator)

@@ -1,6 +1,6 @@
-"""The pass of a policy that is a perceptron of features, compiled.
+"""The forward pass of a perceptron policy on features, compiled.
 
-With a hundred cars TensorDict, modules and distributions take ten times as long as the products of a pass.
+With a hundred cars, TensorDict, modules and distributions take ten times as long as a pass's matrix products.
 """
 
 import math
@@ -30,17 +30,17 @@ Actions = NDArray[np.float32] | NDArray[np.int64]
 
 
 class CompiledPolicy:
-    """Drives with a policy's present weights."""
+    """Computes actions with a policy's present weights."""
 
     def __init__(self, policy: ProbabilisticActor) -> None:
-        """Use the policy's parameters, which stay its own; it fits (`of`)."""
+        """Use the parameters of a policy that fits (`of`) in place."""
         layers, self._log_std = policy_layers(policy)
         self._linear, self._activation = linear_layers(layers)
         self._outputs = outputs_of(self._linear, 0)
 
     @classmethod
     def of(cls, policy: torch.nn.Module) -> Self | None:
-        """Return the compiled pass of a policy; None unless it is a perceptron as `build_actor_critic` makes it."""
+        """Return the compiled pass of a policy; None unless it is a perceptron of `build_actor_critic`."""
         fits = (
             isinstance(policy, ProbabilisticActor)
             and policy.in_keys == ["observation"]
@@ -55,7 +55,7 @@ class CompiledPolicy:
 
         Args:
             observation: [N, features].
-            noise: Standard normal numbers that decide: one for an index, [N, 1], two for steering and speed, [N, 2].
+            noise: Standard normal numbers to sample with: one for an index, [N, 1], two for steering and speed, [N, 2].
 
         Returns:
             int64 [N] or float32 [N, 2], and float32 [N].
@@ -92,8 +92,8 @@ class CompiledPolicy:
 def _layer(inputs, weights, bias, activation, outputs):  # type: ignore[no-untyped-def]
     """Write the outputs of a layer, [N, units], for weights [inputs, units].
 
-    A row's sums have one order. A BLAS has another for another number of rows, so that a run would depend on how its
-    cars are spread over processes. Four rows at a time read each weight once, which takes half the time.
+    A row is always summed in the same order. In a BLAS, the order depends on the number of rows, and a run would depend
+    on how its cars are spread over processes. Four rows at a time read each weight once, which takes half the time.
     """
     rows, units = outputs.shape
     together = rows - rows % 4

@@ -1,4 +1,4 @@
-"""Convolutions of pictures on a processor: few operations, in parts that its cores take as they are free.
+"""Convolutions of pictures on the CPU, in parts that free cores take.
 
 The first layer sees one channel and moves on by several pixels, which the processor's products of matrices do not suit.
 Here each block of stride x stride pixels becomes as many channels, and the same weights in another order the kernel of
@@ -21,9 +21,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 PART = 128
-"""Pictures that are convolved at a time by a thread."""
+"""Pictures per part: a thread convolves one part at a time."""
 _BLOCK_ROWS = {2: torch.int16, 4: torch.int32, 8: torch.int64}
-"""Type as wide as a row of a block of so many bytes: to move rows is ten times as fast as to move bytes."""
+"""Integer type by the width in bytes of a block's row: moving whole rows is ten times as fast as moving bytes."""
 
 _T = TypeVar("_T")
 _R = TypeVar("_R")
@@ -33,9 +33,9 @@ def convolve(layers: nn.Sequential, pictures: Tensor, dtype: torch.dtype) -> Ten
     """Return the outputs of layers that begin with a convolution without padding, flat, [n, channels * places].
 
     Args:
-        layers: they see shares of the brightest, 0 to 1.
+        layers: their inputs are brightness from 0 to 1.
         pictures: uint8 [n, channels, height, width].
-        dtype: of the products, float32 or bfloat16.
+        dtype: of the matrix products, float32 or bfloat16.
     """
     if pictures.is_cuda:
         return _convolve(layers, pictures, dtype)
@@ -63,7 +63,7 @@ class _InParts(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         def by_weights(part: tuple[Tensor, Tensor]) -> tuple[Tensor, ...]:
-            # Another loss may want the gradients of the same outputs.
+            # Another loss may need gradients of the same outputs.
             return torch.autograd.grad(part[0], ctx.weights, part[1], retain_graph=True)
 
         first, *others = _in_turns(by_weights, list(zip(ctx.parts, gradient.split(PART), strict=True)))
@@ -85,7 +85,7 @@ def _convolve(layers: nn.Sequential, pictures: Tensor, dtype: torch.dtype) -> Te
             blocks = _blocks(pictures, stride).to(dtype)
             values = functional.conv2d(blocks, _of_blocks(weight, stride), first.bias)
         for layer in list(layers)[1:]:
-            # Nothing but the activation needs what it is computed from.
+            # Only the activation needs its input, which may therefore be overwritten.
             values = functional.relu_(values) if isinstance(layer, nn.ReLU) else layer(values)
         return values.flatten(1)
 
@@ -93,7 +93,7 @@ def _convolve(layers: nn.Sequential, pictures: Tensor, dtype: torch.dtype) -> Te
 def _blocks(pictures: Tensor, size: int) -> Tensor:
     """Return [n, channels * size * size, height / size, width / size] of bytes, channels last.
 
-    They are those of PyTorch's `pixel_unshuffle`, which takes eight times as long for bytes: a fifth of an update.
+    The result equals PyTorch's `pixel_unshuffle`, which takes eight times as long for bytes: a fifth of an update.
     """
     count, channels, height, width = pictures.shape
     rows = pictures.contiguous()
@@ -114,7 +114,7 @@ def _of_blocks(weight: Tensor, size: int) -> Tensor:
 
 
 def _in_turns(function: Callable[[_T], _R], parts: Sequence[_T]) -> list[_R]:
-    """Return what a function makes of each part, on as many threads as torch has here."""
+    """Apply a function to each part, on torch's number of threads; return the results."""
     threads = torch.get_num_threads()
     if threads == 1 or len(parts) == 1:
         return [function(part) for part in parts]

@@ -1,9 +1,8 @@
 """The inner loop of clipped PPO for perceptrons of features, compiled.
 
-A gradient step on some hundred steps of features is small: TorchRL, TensorDict and autograd need four times as long as
-the products it consists of. Here the derivatives of `ClipPPOLoss` stand as formulas, and an epoch's gradient steps are
-one call. Pictures, shared trunks, and networks and losses of the user's own are differentiated
-by autograd, see `PPO`.
+A gradient step on some hundred steps of features is small: TorchRL, TensorDict and autograd take four times as long as
+its matrix products. Here the derivatives of `ClipPPOLoss` are formulas, and an epoch's gradient steps are one call.
+Pictures, shared trunks, and networks and losses of the user's own are differentiated by autograd, see `PPO`.
 """
 
 import functools
@@ -37,7 +36,7 @@ COLUMNS = ("policy loss", "value loss", "entropy", "clip fraction", "kl", "gradi
 """Columns returned for each gradient step: the value loss is weighted by `critic_coeff`, entropy and `kl` are in nats,
 and the norm is that before clipping."""
 
-# Sums may be reordered; NaN and infinity must stay what they are, since they end a run.
+# Sums may be reordered; NaN and infinity must be preserved, since they end a run.
 compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "arcp", "nsz"})
 
 
@@ -63,20 +62,20 @@ class Scale(NamedTuple):
 
 
 class Loss(NamedTuple):
-    """What the loss is made of."""
+    """Coefficients of the loss."""
 
     entropy_coeff: float
     critic_coeff: float
     clip_epsilon: float
     huber: bool
-    """Whether the value loss is Huber's, not the mean squared error."""
+    """Whether the value loss is Huber's instead of the mean squared error."""
 
 
 class InnerLoop:
-    """Makes the gradient steps of an epoch, for a policy and a value network that share nothing."""
+    """Makes the gradient steps of an epoch, for a policy and a value network that share no layers."""
 
     def __init__(self, networks: ActorCritic, optimizer: torch.optim.Adam, config: PPOConfig) -> None:
-        """Use the parameters of the networks and the moments of the optimizer, which stay theirs.
+        """Use the parameters of the networks and the moments of the optimizer in place.
 
         The networks fit (`fits`); the optimizer is that of `networks.parameters()`, without weight decay.
         """
@@ -91,7 +90,7 @@ class InnerLoop:
 
     @staticmethod
     def fits(networks: ActorCritic) -> bool:
-        """Return whether the networks are perceptrons that share nothing, as `build_actor_critic` makes them."""
+        """Return whether the networks are perceptrons of `build_actor_critic` that share no layers."""
         heads = (policy_layers(networks.policy_head)[0], networks.value_head.module)
         return networks.trunk is None and all(map(is_plain, heads))
 
@@ -128,7 +127,7 @@ class InnerLoop:
         return torch.from_numpy(table[:made])
 
     def _epoch_of_two(self, steps, size, networks, loss, moments, adam) -> tuple[Floats, int]:  # type: ignore[no-untyped-def]
-        """Do what `_epoch` does, bit for bit, with the value network on a thread of its own.
+        """Make the gradient steps of `_epoch`, bit for bit, with the value network on a thread of its own.
 
         The threads sleep while one waits for the other: waiting in a loop, as OpenMP does, takes away the core that
         the other needs on a busy machine.
@@ -173,7 +172,7 @@ class InnerLoop:
 
 @functools.cache
 def _limit_products() -> None:
-    """Let matrix products in this process have one thread from now on: more of them wait for one another.
+    """Limit matrix products in this process to one thread from now on: more would wait for one another.
 
     Limits for each call alone cost a millisecond an epoch.
     """

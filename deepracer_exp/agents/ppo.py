@@ -32,8 +32,8 @@ _LOSS_NAMES = {
 class _Loss(ClipPPOLoss):
     """ClipPPOLoss for distributions with an entropy in closed form.
 
-    The library's version looks at every entropy of the minibatch and falls back to sampling where one is not
-    finite, which would end in an error of torch.multinomial instead of the name of what is not finite.
+    The library's version looks at every entropy of the minibatch and falls back to sampling where one is not finite,
+    which ends in an error of torch.multinomial that does not name the value.
     """
 
     def _get_entropy(self, dist: Distribution, adv_shape: torch.Size) -> Tensor:
@@ -43,10 +43,9 @@ class _Loss(ClipPPOLoss):
 class PPO(Algorithm):
     """Clipped PPO.
 
-    The meaning of the hyperparameters is DeepRacer's: advantages standardised once over the whole batch,
-    a constant clip range, every epoch a new shuffle, a last minibatch that is not full left out. Unlike
-    DeepRacer's trainer, episodes need not be complete: an open or truncated one is continued by the value of
-    its last observation.
+    Hyperparameters have DeepRacer's meaning: advantages standardised once over the whole batch, a constant clip range,
+    every epoch a new shuffle, a last minibatch that is not full left out. Unlike DeepRacer's trainer, episodes need not
+    be complete: an open or truncated one is continued by the value of its last observation.
     """
 
     networks: ActorCritic
@@ -102,7 +101,7 @@ class PPO(Algorithm):
         return self._compiled if type(self).loss is PPO.loss else None
 
     def __str__(self) -> str:
-        """Return its name and what makes the gradient steps."""
+        """Return the algorithm's name, and whether its gradient steps are compiled."""
         return f"{type(self).__name__}, {'compiled' if self._inner_loop is not None else 'by its loss in autograd'}"
 
     def loss(self, minibatch: TensorDictBase) -> TensorDictBase:
@@ -248,7 +247,7 @@ class PPO(Algorithm):
         lr: float,
         entropy_coeff: float,
     ) -> Tensor:
-        """Do what `_gradient_step` does for each minibatch of an epoch, and return the same of each."""
+        """Make the gradient steps of an epoch, and return the metrics of each, as `_gradient_step` does."""
         columns = [steps[key] for key in ("observation", "action", "action_log_prob")]
         columns += [steps[key].squeeze(-1) for key in ("advantage", "value_target")]
         columns = [column.index_select(0, order) for column in columns]
@@ -269,7 +268,7 @@ class PPO(Algorithm):
 
 
 def _rows(steps: TensorDictBase, order: Tensor) -> TensorDictBase:
-    """Return some steps; pictures are copied in a ninth of the time that `steps[order]` takes."""
+    """Select steps; pictures are copied in a ninth of the time of `steps[order]`."""
     rows = steps.apply(lambda values: values.index_select(0, order), batch_size=order.shape)
     assert rows is not None
     return rows

@@ -1,4 +1,4 @@
-"""The steps that soft actor-critic learns from again, in TorchRL's replay buffer."""
+"""The replay of soft actor-critic, in TorchRL's replay buffer."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,14 +11,14 @@ _FOLLOWING = ("reward", "done", "terminated")
 
 
 class Replay:
-    """The newest control steps of all cars, each with what was seen before and after it."""
+    """The newest transitions of all cars: `obs, action, next_obs, reward, done`."""
 
     def __init__(
         self, keys: Sequence[str], most_steps: int, most_bytes: int, generator: torch.Generator
     ) -> None:
-        """Begin without a step; the first batch says how large one is.
+        """Start empty; the first batch decides the size of a step.
 
-        `keys` are those kept of what the cars see; of the bounds `most_steps` and `most_bytes` the narrower holds.
+        `keys` are the kept entries of the observation; the narrower of the bounds `most_steps` and `most_bytes` holds.
         `generator` draws the steps.
         """
         self._keys, self._most_steps, self._most_bytes = tuple(keys), most_steps, most_bytes
@@ -37,19 +37,19 @@ class Replay:
         self._add(steps.transpose(0, 1).reshape(-1))
 
     def sample(self, size: int) -> TensorDictBase:
-        """Return steps [size], drawn with repetition: keys as in a batch."""
+        """Return steps [size], drawn with replacement; keys as in a batch."""
         assert self._buffer is not None
         steps: TensorDictBase = self._buffer.sample(size)
         return steps
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the steps where they lie in the buffer, and where the next one goes."""
+        """Return the steps in their places in the buffer, and the place of the next one."""
         if self._buffer is None:
             return {}
         return {"steps": self._buffer[:].to_dict(), "writer": self._buffer.writer.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a `state_dict` into a replay without steps; with the same generator it draws the same steps."""
+        """Restore a `state_dict` into an empty replay; with the same generator it draws the same steps."""
         if state:
             self._add(TensorDict(state["steps"], state["steps"]["action"].shape[:1]))
             assert self._buffer is not None

@@ -30,18 +30,18 @@ _DISTANCES = {"huber": "smooth_l1", "mean squared error": "l2"}
 
 @dataclass(frozen=True, kw_only=True)
 class SACMetrics(UpdateMetrics):
-    """What an update of `SAC` did; `value_loss` is the critics', `entropy` an estimate from sampled actions."""
+    """Metrics of an update of `SAC`; `value_loss` is the critics', `entropy` an estimate from sampled actions."""
 
     alpha: float
     """Temperature at the end of the update."""
     target_entropy: float | None
-    """Entropy in nats to which a learned temperature leads; None: it is fixed."""
+    """Target entropy in nats of a learned temperature; None: the temperature is fixed."""
     q_value: float | None
-    """What the critics expect of the policy's actions: discounted rewards, without the entropy of the first step."""
+    """The critics' value of the policy's actions: discounted rewards, without the entropy of the first step."""
     replay_steps: int
-    """Steps that the replay can draw."""
+    """Steps in the replay."""
     gradient_steps: int
-    """Made in this update."""
+    """Gradient steps of this update."""
 
 
 class SAC(Algorithm):
@@ -113,7 +113,7 @@ class SAC(Algorithm):
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything but the replay, which has its own: tensors on the CPU and plain values only."""
+        """Return everything except the replay, which has its own state: tensors on the CPU and plain values only."""
         optimizer = self._optimizer.state_dict()
         moments = {
             index: {key: value.cpu() for key, value in state.items()}
@@ -150,7 +150,7 @@ class SAC(Algorithm):
             "loss_function": _DISTANCES[config.loss_type],
             "alpha_init": config.alpha,
             "fixed_alpha": not config.learn_alpha,
-            "deactivate_vmap": True,  # as fast, and runs every layer of a user's own
+            "deactivate_vmap": True,  # as fast, and works for every layer of a user's own
         }
         critics = list(learner.critics)
         count = learner.action_count
@@ -169,7 +169,7 @@ class SAC(Algorithm):
         return loss.to(self._device)
 
     def _steps_due(self, collected: int) -> int:
-        """Return how many gradient steps follow a batch."""
+        """Return the number of gradient steps after a batch."""
         if self._collected_steps < self.config.warmup_steps:
             return 0
         self._owed_steps += collected / self.config.steps_per_gradient_step
@@ -211,7 +211,7 @@ class SAC(Algorithm):
         return math.exp(self._loss.log_alpha.item())
 
     def _own_of_loss(self) -> dict[str, Tensor]:
-        """Return what only the loss holds: delayed copies and the temperature's logarithm, by name."""
+        """Return the state that only the loss holds: delayed copies and the temperature's logarithm, by name."""
         held = [*self._loss.named_parameters(), *self._loss.named_buffers()]
         return {
             name: value
@@ -221,7 +221,7 @@ class SAC(Algorithm):
 
     @torch.no_grad()
     def _publish(self) -> None:
-        """Give `networks` the weights that were learned; TorchRL keeps those of the critics in one stack."""
+        """Copy the learned weights into `networks`; TorchRL keeps those of the critics in one stack."""
         for number, critic in enumerate(self.networks.critics):
             stack = self._loss.qvalue_network_params.data[number]
             TensorDict.from_module(critic).data.copy_(stack)
@@ -230,7 +230,7 @@ class SAC(Algorithm):
 
     @torch.no_grad()
     def _take_networks(self) -> None:
-        """Learn from the weights of `networks`, with delayed copies of these."""
+        """Start learning from the weights of `networks`, with delayed copies of them."""
         if self._learner is not self.networks:
             self._learner.load_state_dict(self.networks.state_dict())
         for number, critic in enumerate(self.networks.critics):

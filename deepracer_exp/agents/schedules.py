@@ -9,7 +9,7 @@ import math
 from deepracer_exp.config.learning import AdaptiveKLLR, FallingLR, LRScheduleConfig, MultipliedLR, PresetLR
 from deepracer_exp.config.own_class import OwnClass, build_own
 
-# A warm-up counted in fractions of the budget begins at fraction 0; its first update must still learn.
+# A warm-up counted in fractions of the budget begins at fraction 0; its first update must still have a rate above 0.
 _LOWEST_WARMUP_FACTOR = 0.01
 
 
@@ -26,10 +26,10 @@ class Schedule:
         raise NotImplementedError
 
     def observe(self, kl: float) -> None:
-        """Take note of how far the last update moved the policy: KL divergence in nats."""
+        """Observe the KL divergence, in nats, of the last update."""
 
     def state_dict(self) -> dict[str, float]:
-        """Return what a resumed run needs of `observe`."""
+        """Return the state that `observe` has changed, for a resumed run."""
         return {}
 
     def load_state_dict(self, state: dict[str, float]) -> None:

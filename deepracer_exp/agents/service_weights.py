@@ -34,19 +34,19 @@ SAC_HIDDEN = 256
 _SAC_POLICY = re.compile(r"main_level/agent(?:_\d+)?/policy/(?:online|global)/network_0/(.+)")
 _SAC_HEAD = "sac_policy_head_0/"
 _RESCALER = "gradients_from_head_0-0_rescalers"
-"""A factor on gradients that the service keeps among the weights of each network; always 1."""
+"""A gradient scale that the service keeps among the weights of each network; always 1."""
 _LOG_STD_RANGE = (-20.0, 3.0)
 """Range to which the service clips the logarithm of the standard deviation."""
 _UNUSED = re.compile(r"/target/|/(?:Adam(?:_1)?|Variable|global_step)$|(?:^|/)beta[12]_power$")
-"""Tensors other than the weights that the service drives with: target networks, optimizer, counters."""
+"""Tensors that are not weights of the driving networks: target networks, optimizer, counters."""
 
 
 class _Layer(NamedTuple):
     name: str
-    """The service's, without `/kernel` and `/bias`."""
+    """The service's name, without `/kernel` and `/bias`."""
     module: nn.Linear | nn.Conv2d
     inputs: npt.NDArray[np.int64] | None = None
-    """Our number of each of the service's inputs; None: the same."""
+    """Our index of each of the service's inputs; None: the same order."""
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
@@ -81,7 +81,7 @@ class _Layer(NamedTuple):
 
 
 def to_service(networks: PolicyNetworks, sensors: Sequence[str]) -> dict[str, Array]:
-    """Return the parameters as the service's tensors, by name.
+    """Convert the parameters to the service's tensors, by name.
 
     `sensors` are the names of the camera and the LIDAR as in model_metadata.json.
 
@@ -162,7 +162,7 @@ def policy_of_sac(tensors: Mapping[str, Array], where: str) -> dict[str, Array]:
 
 
 def _outputs(tensors: Mapping[str, Array], layer: str) -> int:
-    """Return how many outputs a dense layer has, -1 if it is none."""
+    """Return the number of outputs of a dense layer, -1 for any other."""
     kernel, bias = tensors.get(f"{layer}/kernel"), tensors.get(f"{layer}/bias")
     is_dense = kernel is not None and bias is not None and kernel.ndim == 2 and bias.shape == kernel.shape[1:]
     return kernel.shape[1] if is_dense and kernel is not None else -1
@@ -171,7 +171,7 @@ def _outputs(tensors: Mapping[str, Array], layer: str) -> int:
 def from_service(
     tensors: Mapping[str, Array], networks: PolicyNetworks, sensors: Sequence[str], where: str
 ) -> None:
-    """Give networks the parameters of the service's tensors; arguments and errors as of `match_service`."""
+    """Load the service's tensors into networks; arguments and errors as for `match_service`."""
     layers, scale = _layers(networks, sensors)
     matched, _ = match_service(tensors, networks, sensors, where)
     with torch.no_grad():

@@ -47,7 +47,7 @@ class SoftActorCritic(PolicyNetworks):
 
     @property
     def in_keys(self) -> list[str]:
-        """What policy and critics see."""
+        """Keys that policy and critics read."""
         networks = [self.policy_head, *self.critics]
         return sorted({key for network in networks for key in network.in_keys if key != "action"})
 
@@ -61,7 +61,7 @@ class BoundedGaussian(nn.Module):
         self.layers = layers
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Return both."""
+        """Return mean and standard deviation."""
         mean, log_std = self.layers(*inputs).chunk(2, dim=-1)
         return mean, log_std.clamp(*_LOG_STD).exp()
 
@@ -72,7 +72,7 @@ def build_soft_actor_critic(
     action_count: int | None,
     generator: torch.Generator | None,
 ) -> SoftActorCritic:
-    """Build the networks with weights drawn from `generator`; arguments and errors as of `build_actor_critic`.
+    """Build the networks with weights drawn from `generator`; arguments and errors as for `build_actor_critic`.
 
     A network of the user's own is the policy; its critics are perceptrons that see features.
     """

@@ -44,7 +44,7 @@ class Collector:
     Each batch is a TensorDict of batch size [cars of all processes, T], keys as in `RaceEnv` plus the policy's.
 
     Attributes:
-        ahead_s: Seconds for which the last batch had been driven when it was asked for, see `begin_next`.
+        ahead_s: Seconds that the last batch had a head start, see `begin_next`.
     """
 
     ahead_s = 0.0
@@ -137,10 +137,10 @@ class Collector:
             return whole, spent_s
 
     def begin_next(self) -> None:
-        """Let the workers begin the next batch with the policy published last, while the caller does other things.
+        """Let the workers begin the next batch with the policy published last, while the caller does other work.
 
-        Until it is asked for, only `state_dict`, which is that before this batch, and `close` may be called. Cars of
-        this process wait until it is asked for.
+        Until `next_batch`, only `close` and `state_dict`, which is that before this batch, may be called. Cars in this
+        process wait for `next_batch`.
         """
         if self._watchdog is not None:
             self._states = self._worker_states()
@@ -169,7 +169,7 @@ class Collector:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything that the next batch depends on except the policy: arrays and plain values.
+        """Return the state that decides the next batch, except the policy: arrays and plain values.
 
         It is the state at the end of the last batch; call it before the next. Raises as `next_batch`.
         """
@@ -244,7 +244,7 @@ class Collector:
         )
 
     def _ask(self, question: Callable[[], _T], silence: str) -> _T:
-        """Return the workers' answer, or raise what `silence` says of the one that does not give it in time.
+        """Return the workers' answer, or raise the error `silence` about a worker that does not answer in time.
 
         TorchRL alone would wait for it forever.
         """
@@ -338,13 +338,13 @@ class Collector:
 
 
 def _in_background(question: Callable[[], _T]) -> Future[_T]:
-    """Ask on a thread of its own, which does not keep the process from ending, and return what will be the answer."""
+    """Ask on a daemon thread and return a future of the answer."""
     answer: Future[_T] = Future()
 
     def ask() -> None:
         try:
             answer.set_result(question())
-        except BaseException as error:  # noqa: BLE001 - raised again by the thread that waits
+        except BaseException as error:  # noqa: BLE001 - raised again by the waiting thread
             answer.set_exception(error)
 
     threading.Thread(target=ask, name="ask the workers", daemon=True).start()
@@ -360,17 +360,17 @@ def open_collector(
     state: Mapping[str, Any] | None = None,
     rivals: Rivals | None = None,
 ) -> Collector:
-    """Start the cars where the configuration wants them.
+    """Start the cars in this process or in workers, as configured.
 
     Args:
         config: the collector's group.
         algorithm: says how many frames or episodes an iteration has.
-        setup: what the cars need.
+        setup: the race.
         policy: reads what its network sees of a `RaceEnv`, writes `action` and its log-probability.
         run_dir: where workers leave crash dumps and prints.
         state: `state_dict` of a collector of the same configuration and setup: with the same weights, the next batch
             is what that one would have returned next, bit for bit. None or empty: new episodes begin.
-        rivals: what the cars race against; None: they are alone.
+        rivals: of the cars; None: they are alone.
 
     Raises:
         BadInput: the state is of other cars, or of another number of processes.
@@ -381,7 +381,7 @@ def open_collector(
 
 
 def frames_per_batch(config: CollectorConfig, algorithm: AlgorithmConfig) -> int:
-    """Return the control steps, over all cars, to ask of a collector at a time."""
+    """Return the control steps of a batch, over all cars."""
     frames = algorithm.frames_per_iteration
     return config.cars * _CHUNK_STEPS if frames is None else frames
 
@@ -394,7 +394,7 @@ def worker_count(config: CollectorConfig) -> int:
 
 
 def steps_per_batch(config: CollectorConfig, frames: int) -> int:
-    """Return the steps of each car in a batch of so many frames over all cars, rounded up to whole steps of all."""
+    """Return the steps of each car in a batch of this many frames over all cars, rounded up."""
     return -(-frames // config.cars)
 
 

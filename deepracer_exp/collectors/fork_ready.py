@@ -1,4 +1,4 @@
-"""Imported last by the fork server, and by nothing else: what the first compiled call in a process costs is paid here.
+"""Imported last by the fork server, and by nothing else: makes the slow first compiled call of a process.
 
 numba then loads what all its functions need, a third of a second, which the server does while the training process
 imports; each worker would do it while the training waits.

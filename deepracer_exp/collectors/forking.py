@@ -5,16 +5,16 @@ import signal
 import sys
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-"""What is sent to the process group for the training process alone, which ends its workers."""
+"""Signals that reach the whole process group but are meant for the training process, which ends its workers."""
 _PROGRAM = "deepracer_exp.cli"
-"""What every worker imports first: the program of the process that started it."""
+"""Module that every worker imports first: the program of the process that started it."""
 
 
 def start_workers_early(wanted: bool, *modules: str) -> None:
-    """Start the server that workers are forked from, if wanted, which imports what they need in the meantime.
+    """Start the server that workers are forked from, if needed; it imports their modules in the background.
 
     It must be called in the main thread, with whose end the server ends. `modules` are imported for workers of a sweep;
-    without them, what workers of a collector need.
+    without them, those of a collector's workers.
     """
     if not wanted or not sys.platform.startswith("linux"):
         return
@@ -30,7 +30,7 @@ def start_workers_early(wanted: bool, *modules: str) -> None:
     # Workers share the cores among themselves already; a linear-algebra thread pool in each would only compete.
     before = os.environ.get("OMP_NUM_THREADS")
     os.environ["OMP_NUM_THREADS"] = "1"
-    # The server inherits this until it ignores them; here they are acted on afterwards.
+    # Blocked until the server, which inherits this, ignores them; here they are handled afterwards.
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     try:
         forkserver.ensure_running()

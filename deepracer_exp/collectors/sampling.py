@@ -20,8 +20,8 @@ NOISE = "noise"
 class SamplingPolicy(TensorDictModuleBase):
     """A policy that draws each car's action from the car's own random numbers, the key `NOISE`.
 
-    Sampling from a generator of the process would make a run depend on how its cars are spread over processes. It
-    reads what the policy does, shares its parameters, and writes `action` and `action_log_prob`.
+    Sampling from a generator of the process would make a run depend on how its cars are spread over processes. It has
+    the policy's inputs, shares its parameters, and writes `action` and `action_log_prob`.
     """
 
     def __init__(self, policy: TensorDictModuleBase) -> None:
@@ -38,7 +38,7 @@ class SamplingPolicy(TensorDictModuleBase):
         return tensordict
 
     def act(self, seen: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        """Return `action` and `action_log_prob` of N cars for what they see, (N, ...) by key."""
+        """Return `action` and `action_log_prob` of N cars for their observations, (N, ...) by key."""
         if self._compiled is not None:
             action, log_prob = self._compiled.sample(seen["observation"], seen[NOISE])
             return {"action": action, "action_log_prob": log_prob}

@@ -71,12 +71,12 @@ class Watchdog:
         threading.Thread(target=wait_for_a_death, name="first death", daemon=True).start()
 
     def expect(self, steps: int) -> None:
-        """Note that each worker has been asked for so many more steps, and that we wait for them."""
+        """Start waiting for this many more steps of each worker."""
         self._asked += steps
         self._waiting.set()
 
     def rest(self) -> None:
-        """Note that nothing is waited for."""
+        """Stop waiting."""
         self._waiting.clear()
 
     def close(self) -> None:
@@ -86,7 +86,7 @@ class Watchdog:
         self._file.unlink(missing_ok=True)
 
     def use(self) -> Use:
-        """Return what all workers use of the machine."""
+        """Return the use of the machine by all workers."""
         return use_of(*self._pids)
 
     def _watch(self) -> None:

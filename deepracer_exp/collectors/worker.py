@@ -31,11 +31,11 @@ from .sampling import NOISE
 class CarCollector(Collector):
     """TorchRL's collector of a `RaceEnv`, driven by a `SamplingPolicy` of this process.
 
-    It leaves out what nothing here reads: numbers of trajectories, and moves to another device.
+    It leaves out what nothing here needs: trajectory ids and moves to another device.
     """
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
-        """Set it up as the library does."""
+        """Set up as the base class does."""
         super().__init__(*arguments, **options)
         self.storing_device = None
         self._batch = self.fake_tensordict()
@@ -81,12 +81,12 @@ class EnvFactory:
     threads: int
     run_dir: Path
     rivals: Rivals | None = None
-    """What the cars race against; None: they are alone."""
+    """Rivals of the cars; None: they are alone."""
     heartbeat: Path | None = None
     """File of the counted steps; None if the environment does not live in a worker process."""
 
     def __call__(self) -> RaceEnv:
-        """Return the environment, with the process around it made ready."""
+        """Prepare this process, and return the environment."""
         if self.heartbeat is not None:
             # A terminal sends Ctrl-C, a service manager SIGTERM, to all processes: the training process handles it.
             signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -142,7 +142,7 @@ class _StateKeepingEnv(RaceEnv):
         self.observation_spec[NOISE] = Unbounded((race.n_cars, width), dtype=torch.float64)
 
     def fake_tensordict(self) -> TensorDictBase:
-        """Return what a batch holds of a step: `trace` under `next` alone, where the training reads it."""
+        """Return a step as batches hold it: `trace` only under `next`, where the training reads it."""
         return super().fake_tensordict().exclude("trace")
 
     def _reset(self, tensordict: TensorDictBase | None, **options: object) -> TensorDictBase:
@@ -166,7 +166,7 @@ class _StateKeepingEnv(RaceEnv):
 
     @property
     def seen(self) -> dict[str, np.ndarray]:
-        """What policies may read now, by key."""
+        """The present observation, by key."""
         return {**super().seen, NOISE: self._drawn}
 
     def drive(self, action: np.ndarray) -> dict[str, np.ndarray]:
