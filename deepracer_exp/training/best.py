@@ -14,11 +14,11 @@ _DRIVING = "driving"
 
 
 class BestPolicy:
-    """Remembers the best policy of a run, and says of each new one whether it ranks above.
+    """Remembers the best policy of a run, and ranks each new one against it.
 
     Attributes:
-        record: iteration and env steps of the best policy, what it was ranked by, its rank and its evaluation, JSON
-            types; None before there is one.
+        record: iteration and env steps of the best policy, its criterion, rank and evaluation, JSON types; None before
+            there is one.
     """
 
     def __init__(self, experiment: Experiment, setup: RaceSetup):
@@ -39,7 +39,7 @@ class BestPolicy:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the best policy's record, and what is known of each track."""
+        """Return the best policy's record, and the last result of each track."""
         return {"best": self.record, "ranking": self._ranking.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:

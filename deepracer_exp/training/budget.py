@@ -1,4 +1,4 @@
-"""The budget: what a run has used of it, whether any is left, and alerts."""
+"""The budget of a run: use, exhaustion and alerts."""
 
 import logging
 import shlex
@@ -52,12 +52,12 @@ class Budget:
         return max(((limit, used / most) for limit, used, most in spent), key=lambda share: share[1])
 
     def scheduled(self, env_steps: int, iterations: int, wall_clock_s: float) -> float:
-        """Return where the schedules that follow the budget are, 0 to 1, their end; arguments as of `used`."""
+        """Return the position of schedules that follow the budget, 0 to 1 (their end); arguments as for `used`."""
         _, share = self.used(env_steps, iterations, wall_clock_s)
         return min(share / self._config.schedule_until, 1.0)
 
     def alerts(self, env_steps: int, iterations: int, wall_clock_s: float) -> list[Alert]:
-        """Return what was passed since the last call, at most one alert a limit; the first call sets the start."""
+        """Return alerts for shares passed since the last call, at most one per limit; the first call sets the start."""
         first, passed = not self._alerted, []
         for limit, used, most in self._spent(env_steps, iterations, wall_clock_s):
             percent = max((share for share in self._config.alerts if 100 * used >= share * most), default=0)
@@ -73,7 +73,7 @@ class Budget:
         return " or ".join(_WORDS[name](most) for name, most in _limits(self._config).items())
 
     def _spent(self, env_steps: int, iterations: int, wall_clock_s: float) -> list[tuple[str, float, float]]:
-        """Return of each limit its key, what the run has used of it, and the limit."""
+        """Return key, use and value of each limit."""
         used = {"env_steps": env_steps, "iterations": iterations, "minutes": wall_clock_s / 60}
         return [(name, used[name], most) for name, most in _limits(self._config).items()]
 
@@ -85,8 +85,8 @@ class RunEnded(BadInput):
 def refuse_ended(run_dir: Path, config: BudgetConfig, overrides: Sequence[str]) -> None:
     """Refuse to resume a run that has ended.
 
-    With another stopping rule among the overrides, what ended it, its own rule or a comparison with other runs, does
-    not count; a budget that is still used up does.
+    Overrides with another stopping rule void an ending by the run's own rule or by comparison with other runs, but not
+    by a budget that is still used up.
 
     Raises:
         RunEnded: it says how the run can be resumed anyway.
@@ -123,7 +123,7 @@ class Alerts:
         self._threads: list[threading.Thread] = []
 
     def send(self, message: str, run_dir: Path) -> None:
-        """Send a message of a run; errors are logged."""
+        """Send a message about a run; errors are logged."""
         if self._command is not None:
             arguments = (self._command, message, run_dir)
             self._threads.append(

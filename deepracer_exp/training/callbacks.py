@@ -61,10 +61,10 @@ def standard_callbacks(
 
 
 class EvalCallback(Callback):
-    """Evaluates the policy every few iterations on the trials of group `evaluation`, the same each time."""
+    """Evaluates the policy every few iterations, always on the same trials of the group `evaluation`."""
 
     def __init__(self, experiment: Experiment, console: Console, rival: StoredRun | None = None):
-        """Read what is to be driven; `rival` as for `standard_callbacks`.
+        """Read the protocol of the evaluation; `rival` as for `standard_callbacks`.
 
         Raises:
             BadInput: a track or a condition is unknown or malformed.
@@ -72,7 +72,7 @@ class EvalCallback(Callback):
         self._every = experiment.checkpoints.every
         self._console = console
         sees = None if rival is None else rival.experiment.observation
-        # Cars in this process wait meanwhile; those of workers drive the next batch.
+        # Cars in this process wait for the evaluation; workers drive the next batch during it.
         collector = experiment.collector
         threads = collector.threads if collector.mode == "in_process" else 1
         self._evaluator = (
@@ -82,23 +82,23 @@ class EvalCallback(Callback):
         )
 
     def on_replay(self, trainer: Trainer) -> None:
-        """Remove the evaluation of a policy that was evaluated only because the run ended there."""
+        """Remove an evaluation that was made only because the run had ended."""
         if not self._is_due(trainer.row["iteration"]):
             trainer.row |= NOT_EVALUATED
             for column in AMONG_OTHERS:
                 trainer.row.pop(column, None)
 
     def on_iteration_end(self, trainer: Trainer) -> None:
-        """Evaluate when due, and keep a checkpoint of what was evaluated."""
+        """Evaluate when due, and keep a checkpoint of the evaluated policy."""
         if self._is_due(trainer.iteration):
             self._evaluate(trainer)
             trainer.request_save()
 
     def on_train_end(self, trainer: Trainer) -> None:
-        """Evaluate the policy of the last iteration, if that was not due: it may be the best.
+        """Evaluate the last policy even if no evaluation is due: it may be the best.
 
-        The evaluation is written to metrics.jsonl and the summary but to no checkpoint, so that a run which resumes
-        here is the one that was never interrupted.
+        The evaluation is written to metrics.jsonl and the summary but to no checkpoint, so that a resumed run equals an
+        uninterrupted one.
         """
         if self._evaluator is not None and trainer.iteration and not self._is_due(trainer.iteration):
             self._console.print(f"evaluating the policy of iteration {trainer.iteration}")
@@ -123,7 +123,7 @@ class StoppingCallback(Callback):
         self._reliable: dict[str, float] | None = None
 
     def on_replay(self, trainer: Trainer) -> None:
-        """Let the rule see the rows it had seen."""
+        """Pass a row that the rule has seen before."""
         self._observe(trainer)
 
     def on_iteration_end(self, trainer: Trainer) -> None:
@@ -169,12 +169,12 @@ class BudgetCallback(Callback):
         self._alerts, self._tracker = alerts, tracker
 
     def on_fit_start(self, trainer: Trainer) -> None:
-        """Stop if there is nothing left; what was used before needs no alert."""
+        """Stop if the budget is used up; earlier use needs no alert."""
         self._check(trainer)
         trainer.budget.alerts(*trainer.usage)
 
     def on_iteration_end(self, trainer: Trainer) -> None:
-        """Compare what is used with the limits."""
+        """Compare the use with the limits."""
         self._check(trainer)
         for alert in trainer.budget.alerts(*trainer.usage):
             logger.info(alert.message)
@@ -209,7 +209,7 @@ class RecordCallback(Callback):
 
 
 class ReportCallback(Callback):
-    """Draws the pictures of a run, and writes its page if it is over."""
+    """Draws the pictures of a run, and writes its report once it is over."""
 
     def on_train_end(self, trainer: Trainer) -> None:
         """Draw best_lap.png and learning.png."""

@@ -1,4 +1,4 @@
-"""A run that begins with another run's policy."""
+"""Clones: runs that start from another run's networks."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from deepracer_exp.agents.actor_critic import PolicyNetworks
 
 SLOWER = 0.1
-"""A clone's learning rate over its parent's, where none is given: what racers do with a good model."""
+"""Default learning rate of a clone as a share of its parent's: the usual choice of racers for a good model."""
 _AS_USUAL = (
     "report=true",
     "trace=full",
@@ -36,7 +36,7 @@ _AS_USUAL = (
     "collector.processes=null",
     "collector.threads=0",
 )
-"""Settings for the clone of a sweep's trial, which had one core, no report and a trace of laps alone."""
+"""Settings that a clone does not take from a sweep's trial: one core, no report, a trace of laps only."""
 _ALLOWED = {
     "track": "the policy has to find its way on another road",
     "reward": "values learned for another reward are wrong at first",
@@ -64,7 +64,7 @@ def plan_clone(parent: StoredRun, changes: Sequence[str], *, stored: bool = Fals
 
 
 def read_parent(parent: StoredRun, clone: Experiment) -> "tuple[PolicyNetworks, Lineage]":
-    """Read the networks that a clone begins with, and whose they were; their checkpoint is pinned.
+    """Read a clone's initial networks and their lineage; their checkpoint is pinned.
 
     Raises:
         BadInput: the checkpoint cannot be used.
@@ -84,7 +84,7 @@ def read_parent(parent: StoredRun, clone: Experiment) -> "tuple[PolicyNetworks, 
 
 
 def describe_clone(parent: StoredRun, clone: Experiment, lineage: Lineage) -> list[str]:
-    """Return what a clone has of its parent, and warnings of what it has not, a line each."""
+    """Describe a clone's origin, and warn of each group that differs from its parent's, a line each."""
     before: dict[str, Any] = vars(parent.experiment)
     notes = [
         f"clone of {parent.path.name}, checkpoint {lineage.checkpoint}; learning rate {clone.algorithm.lr:g} "

@@ -1,4 +1,4 @@
-"""The weights of a model that was trained with the service, in networks of our own."""
+"""Load the weights of a model trained with the service into our networks."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -27,7 +27,7 @@ from deepracer_exp.errors import BadInput
 
 
 def networks_to_try(model: StoredModel, files: CustomFiles) -> Iterator[list[str]]:
-    """Yield the overrides for the network that the metadata names, then for those with the model's convolutions."""
+    """Yield overrides for the network that the metadata names, then for the others with the model's convolutions."""
     metadata = files.metadata
     assert metadata is not None
     tensors = policy_of_sac(model.tensors, model.source) if files.is_sac else model.tensors

@@ -1,4 +1,4 @@
-"""What a training takes of the machine: the memory that it will need, and the use while it runs."""
+"""The resources of a training: an estimate of its memory, and the machine's load while it runs."""
 
 import math
 
@@ -14,7 +14,7 @@ _COPIES_OF_PICTURES = 8
 """Copies of a step's picture at the peak of an iteration: before and after it, in workers, batch and shuffled steps.
 Measured: 7.1 with collector=in_process, 7.8 with sync."""
 _OTHER_BYTES = 14
-"""Bytes of a step in a replay beside what is seen: a continuous action, the reward and how it ended."""
+"""Bytes of a step in a replay beside the observations: a continuous action, reward and done flags."""
 
 
 def memory_needed(experiment: Experiment) -> list[str]:
@@ -32,7 +32,7 @@ def _pictures(experiment: Experiment) -> str | None:
     if camera is None:
         return None
     bytes_per_step, free = _COPIES_OF_PICTURES * math.prod(camera.shape), psutil.virtual_memory().available
-    steps = algorithm.frames_per_iteration or 1000  # how long episodes will be is not known
+    steps = algorithm.frames_per_iteration or 1000  # the length of episodes is not known
     needed = steps * bytes_per_step
     if algorithm.frames_per_iteration is not None and needed > free:
         raise BadInput(
@@ -48,13 +48,13 @@ def _pictures(experiment: Experiment) -> str | None:
 
 
 def _replay(experiment: Experiment) -> str | None:
-    """Return a line on a replay that is shorter than it may be, or has pictures; None: there is no such one."""
+    """Return a line on a replay that memory limits, or that holds pictures; None: there is no such replay."""
     algorithm = experiment.algorithm
     if not isinstance(algorithm, SACConfig):
         return None
     observed = observation_shape(experiment.observation)
     picture = math.prod(observed.picture or (0,))
-    # What is seen before and after the step.
+    # The observations before and after the step.
     bytes_per_step = 2 * (4 * (observed.features + (observed.lidar or 0)) + picture) + _OTHER_BYTES
     steps = min(algorithm.replay_steps, algorithm.replay_mb * 10**6 // bytes_per_step)
     if steps < algorithm.batch_size:

@@ -1,4 +1,4 @@
-"""The achievements of the cars: episodes counted from the trace, and the figures of an iteration and of a run."""
+"""Training metrics: episodes counted from the trace, and the figures of an iteration and of a run."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -21,7 +21,8 @@ _FEWEST_EPISODES = 10  # with fewer, the mean completion says little about the p
 
 
 def track_names(setup: RaceSetup) -> list[str]:
-    """Return the names of the courses: of one its own name, which a file may give; of several those of the options."""
+    """Return the names of the courses: of a single one its own, which a file may set; of several those of the
+    options."""
     courses = setup.courses
     return [course.name for course in courses] if len(courses) > 1 else [setup.track.name]
 
@@ -62,7 +63,7 @@ class Record:
 
     @property
     def lap_share(self) -> float | None:
-        """Share of complete laps among the last episodes, None before as many as are remembered have ended."""
+        """Share of complete laps among the `remembered` last episodes, None before so many have ended."""
         last = self._laps_of_last
         return sum(last) / len(last) if len(last) == last.maxlen else None
 
@@ -92,18 +93,18 @@ class Record:
 
 
 class RunMetrics:
-    """Numbers the episodes of a run and remembers how they ended, on one track or on each of several.
+    """Numbers the episodes of a run and counts their endings, by track.
 
     Attributes:
         track_names: in the order of their numbers in the trace.
-        labels: what the tracks are called in metrics; empty with one track, whose metrics need no name.
-        remembered: how many of the last finished episodes `lap_share` looks at.
+        labels: names of the tracks in metrics; empty with one track.
+        remembered: number of last finished episodes in `lap_share`.
         all: the episodes of all tracks.
         tracks: those of each track.
     """
 
     def __init__(self, names: Sequence[str], n_cars: int, step_s: float, stopping: StoppingConfig):
-        """Begin without an episode.
+        """Start without episodes.
 
         Args:
             names: of the tracks, in the order of their numbers in the trace.
@@ -167,7 +168,7 @@ class RunMetrics:
         return row
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the numbers of the episodes under way, the records, and what was known last of each track."""
+        """Return the numbers of the episodes under way, the records, and the last figures of each track."""
         records = [record.state_dict() for record in (self.all, *self.tracks)]
         book = {"number": self._number, "next_number": self._next_number, "records": records}
         return {"book": book, "last": self._last}
@@ -200,7 +201,7 @@ class RunMetrics:
         return {**whole, "tracks": tracks}
 
     def _numbers(self, cars: np.ndarray, begins: np.ndarray) -> np.ndarray:
-        """Return the number of each step's episode, (cars, T), from where episodes begin."""
+        """Return the number of each step's episode, (cars, T), from the flags of their first steps."""
         # Episodes are numbered in the order in which they begin, cars that begin together by their number.
         order = np.argwhere(begins.T)
         numbers = np.full(begins.shape, -1)
@@ -244,7 +245,7 @@ class Ranking:
     """Ranks a policy by the episodes that ended last on each track.
 
     Where a lap takes longer than an iteration, or few cars drive on a track, not every iteration ends an episode on
-    each: a track counts with the last iteration that did.
+    each: a track counts with the last iteration in which one ended.
     """
 
     def __init__(self, lengths_m: Sequence[float]):
@@ -271,7 +272,7 @@ class Ranking:
         return float(self._completion.mean()), float(self._speed_mps.mean())
 
     def state_dict(self) -> dict[str, np.ndarray]:
-        """Return what is known of each track."""
+        """Return the last result of each track."""
         return {"completion": self._completion, "speed_mps": self._speed_mps, "episodes": self._episodes}
 
     def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
@@ -298,7 +299,7 @@ AMONG_OTHERS = ("eval_crash_free", "eval_won")
 
 
 def eval_columns(evaluation: Evaluation) -> dict[str, float | None]:
-    """Return the columns of an evaluation in metrics.jsonl: `EVAL_COLUMNS`, and of `AMONG_OTHERS` what there is."""
+    """Return the columns of an evaluation in metrics.jsonl: `EVAL_COLUMNS`, and those of `AMONG_OTHERS` that apply."""
     usual = evaluation.on(USUAL)
     held_out = evaluation.on(HELD_OUT) if HELD_OUT in evaluation.conditions else None
     return {

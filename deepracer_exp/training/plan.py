@@ -1,4 +1,4 @@
-"""What a training was asked, with the answers: experiment, files, runs; nothing here imports PyTorch."""
+"""Plans of trainings: experiment, files and runs, resolved before PyTorch is imported."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,12 +24,12 @@ class TrainPlan:
 
     experiment: Experiment
     composition: Composition
-    """Where the values of the experiment came from."""
+    """The options that the values of the experiment came from."""
     files: RaceFiles
     rival: StoredRun | None
-    """The run, with its checkpoint, whose policy drives the rivals; None: there are none, or they are the run's own."""
+    """The run and checkpoint whose policy drives the rivals; None: there are none, or the run's own snapshots."""
     parent: StoredRun | None = None
-    """The run, with its checkpoint, whose networks a clone begins with; None: it is no clone."""
+    """The run and checkpoint that a clone starts from; None: this is no clone."""
 
 
 def plan_training(
@@ -56,7 +56,7 @@ def plan_training(
 
 @dataclass(frozen=True)
 class ResumePlan:
-    """A run that is continued."""
+    """A run to resume."""
 
     run_dir: Path
     stored: Mapping[str, Any]

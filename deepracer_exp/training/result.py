@@ -1,4 +1,4 @@
-"""What comes of a training."""
+"""The result of a training."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,12 +8,12 @@ from deepracer_exp.runs.result import Ending
 
 
 class TakenOver(Exception):  # noqa: N818 - reads as what it is at the raise site
-    """Another process continues this run: nothing more may be written of it."""
+    """Another process continues this run: nothing more may be written to it."""
 
 
 @dataclass
 class TrainResult:
-    """The outcome of a training."""
+    """The result of a training."""
 
     ending: Ending
     exit_code: int
@@ -23,9 +23,9 @@ class TrainResult:
     error: BaseException | None = None
     """The exception that ended a failed run."""
     note: str | None = None
-    """A line on what is missing from the results."""
+    """A line for each missing result."""
     unrecorded: str | None = None
-    """A sentence on what its tracker could not record, and why."""
+    """A sentence on what the tracker could not record, and why."""
 
     @property
     def status(self) -> str:

@@ -1,4 +1,4 @@
-"""The policies that a run races against: snapshots of itself, or one of another run."""
+"""The rivals of a run: snapshots of its own policy, or the policy of another run."""
 
 import copy
 from collections.abc import Mapping
@@ -48,13 +48,13 @@ class RivalPool:
 
     @property
     def driving(self) -> tuple[Weights, ...]:
-        """Return the weights among which each episode draws its rival's."""
+        """Return the weights from which each episode draws its rival."""
         weights = list(self.weights.values())
         return tuple(weights[-1:] if self._config.policy == NEWEST else weights)
 
     @property
     def rivals(self) -> Rivals:
-        """Return what the cars need to race against them."""
+        """Return the rivals in a form that workers take."""
         return replace(self._rivals, weights=self.driving)
 
     def newest_policy(self) -> torch.nn.Module:
@@ -63,7 +63,7 @@ class RivalPool:
         return policy
 
     def take(self, iteration: int) -> bool:
-        """Keep a snapshot of the learner where one is due after an iteration; return whether the rivals change."""
+        """Keep a snapshot of the learner if one is due; return whether the rivals change."""
         config = self._config
         if not config.is_own or (self.weights and iteration % config.snapshot_every):
             return False
@@ -73,7 +73,7 @@ class RivalPool:
         return True
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the snapshots; a policy of another run is in a folder of its own."""
+        """Return the snapshots; another run's policy is in a folder of its own."""
         if not self._config.is_own:
             return {}
         return {_STATE: {str(number): dict(weights) for number, weights in self.weights.items()}}

@@ -1,4 +1,4 @@
-"""What an iteration does where its steps, cars and minibatches do not divide."""
+"""Notes on steps, cars and minibatches that do not divide evenly."""
 
 from deepracer_exp.collectors.collector import steps_per_batch
 from deepracer_exp.config.experiment import Experiment
@@ -6,9 +6,9 @@ from deepracer_exp.config.learning import PPOConfig
 
 
 def rounded(experiment: Experiment) -> list[str]:
-    """Return a line for each value of the algorithm that a training does not use as it was given: key, value, actual.
+    """Return a line for each value of the algorithm that is rounded: key, value, actual.
 
-    Of iterations that are counted in episodes nothing is known in advance.
+    Nothing is known in advance of iterations that are counted in episodes.
     """
     algorithm, cars = experiment.algorithm, experiment.collector.cars
     wanted = algorithm.frames_per_iteration

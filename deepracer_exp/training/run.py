@@ -77,7 +77,7 @@ def run_training(
     created: Callable[[Path], None] | None = None,
     projector: Projector | None = None,
 ) -> TrainResult:
-    """Train what was planned, a new run, a clone, or a run from its last checkpoint on; return how it ended.
+    """Train a new run, a clone, or a run from its last checkpoint; return the result.
 
     Args:
         plan: of `plan_training`, `plan_clone` or `plan_resume`.
@@ -111,10 +111,10 @@ def run_training(
 
 
 def store_run(plan: TrainPlan, networks: PolicyNetworks, reason: str) -> TrainResult:
-    """Make a run of networks that were trained elsewhere, as if its training had ended before it began.
+    """Store networks that were trained elsewhere as a run without iterations.
 
-    The reward function is not run. `networks` are its checkpoint, best and last; `reason` says in the summary where
-    they came from.
+    The reward function is not run. `networks` are its checkpoint, best and last; `reason` names their origin in the
+    summary.
 
     Raises:
         BadInput: as for `run_training`; no folder is left.
@@ -125,7 +125,7 @@ def store_run(plan: TrainPlan, networks: PolicyNetworks, reason: str) -> TrainRe
 
 
 def copy_run(run_dir: Path, attempt: int) -> Path:
-    """Copy a run whose process does not release its folder, to resume the copy; return the copy's folder.
+    """Copy a run whose folder another process holds, so that the copy can be resumed; return the copy's folder.
 
     The original keeps its run in MLflow; the copy gets a run of its own there.
 
@@ -313,7 +313,7 @@ def _reopen(
 
 
 def _forget_damaged_best(run_dir: Path, state: dict[str, Any]) -> None:
-    """Let the rest of a run find its best policy where the best so far cannot be read any more."""
+    """Forget the best policy so far if its checkpoint cannot be read any more: a later one will be the best."""
     if state["best"] is None:
         return
     name = checkpoint_name(state["best"]["iteration"])
@@ -327,7 +327,7 @@ def _forget_damaged_best(run_dir: Path, state: dict[str, Any]) -> None:
 
 
 def _moved_schedules(trainer: Trainer, plan: ResumePlan) -> str | None:
-    """Return a line on rates that another budget changes at once, and on what holds them; None: there are none."""
+    """Warn of rates that a new budget changes at once, with the override that holds them; None: there are none."""
     before, now = parse_config(dict(plan.stored["budget"]), BudgetConfig), plan.experiment.budget
     budgets = [Budget(config) for config in (before, now)]
     old, new = (
@@ -355,12 +355,12 @@ def _print_lines(lines: Sequence[str], console: Console) -> None:
 
 
 def _printing(console: Console) -> Callable[[str], None]:
-    """Return what prints a line as it is, above the view of the progress where that is shown."""
+    """Return a function that prints a line as it is, above the progress view if there is one."""
     return lambda line: console.print(line, soft_wrap=True)
 
 
 def _run(trainer: Trainer, interruption: Interruption) -> TrainResult:
-    """Train, and write how it ended, whatever ends it."""
+    """Train, and write the ending, whatever it is."""
     try:
         return _ended(trainer, interruption)
     except TakenOver:
@@ -399,7 +399,7 @@ def _ended(trainer: Trainer, interruption: Interruption) -> TrainResult:
 
 
 def _own_error(error: Exception, experiment: Experiment) -> str | None:
-    """Return a line for an error of a run with classes of the user's own, which are to blame; None: it has none."""
+    """Return a line for an error in a run with classes of the user's own, which it blames; None: it has none."""
     classes = list(own_classes(asdict(experiment)))
     if not classes or isinstance(error, BadInput):
         return None
@@ -428,7 +428,7 @@ def _differences_to_uninterrupted(experiment: Experiment, setup: RaceSetup) -> l
 
 
 def _names(composition: Composition, track: str, reward: str) -> dict[str, str]:
-    """Return what a racer calls the run's choices: an option's name, a file's stem, the folder of custom_files."""
+    """Return readable names of the run's choices: an option's name, a file's stem, the folder of custom_files."""
     choices, mapping = composition.choices, composition.mapping
     actions_file = mapping["action_space"].get("file")
     return {

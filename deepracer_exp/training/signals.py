@@ -7,20 +7,20 @@ from collections.abc import Callable
 from types import FrameType
 
 PATIENCE_S = 4.0
-"""Seconds after a signal at which an iteration that can be left out is; to end the workers takes some more."""
+"""Seconds after a signal at which the iteration in progress is abandoned, if it may be; ending workers takes longer."""
 _LOOK_EVERY_S = 0.1
 
 
 class Interruption:
     """Records a request to end and answers it; a second signal ends at once.
 
-    So does patience: once it is over, the iteration in progress is left out if that loses nothing else.
+    After `PATIENCE_S`, the iteration in progress is abandoned if that loses nothing else.
 
     Attributes:
         may_leave_out: whether all but the iteration in progress is stored.
         left_out: whether the iteration in progress was left out.
 
-    Where one is entered within another, as a training within a worker of a sweep, both have the same request.
+    Nested ones, as of a training within a worker of a sweep, share the same request.
     """
 
     def __init__(self, answer: Callable[[str], None] | None = None) -> None:
@@ -78,6 +78,6 @@ class Interruption:
         while not self._over.wait(_LOOK_EVERY_S):
             if self.may_leave_out and time.monotonic() >= at_s:
                 self.left_out = True
-                # To that thread: a call in which it waits is to return.
+                # To that thread, so that a call in which it waits returns.
                 signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
                 return

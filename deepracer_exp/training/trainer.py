@@ -46,11 +46,11 @@ from .signals import Interruption
 logger = logging.getLogger("deepracer_exp")
 
 _LAST_EVERY, _LAST_EVERY_S = 10, 5.0
-"""Iterations and seconds after which there is a new checkpoint `last`, whichever comes first."""
+"""Iterations and seconds between two checkpoints `last`, whichever is shorter."""
 
 
 class Callback:
-    """Base class of everything that happens around the training loop; each hook does nothing unless overridden.
+    """Base class of callbacks around the training loop; each hook does nothing unless overridden.
 
     The trainer calls a hook of all its callbacks in the order of its list. A hook may read all public attributes of
     the trainer, add columns to `trainer.row` (in `on_iteration_end`, ahead of the callback that records it), and call
@@ -58,7 +58,7 @@ class Callback:
     """
 
     hurries_when_interrupted = False
-    """Leave out `on_train_end` when the run is interrupted, because another process resumes it at once."""
+    """Whether `on_train_end` is skipped when the run is interrupted, because another process resumes it at once."""
 
     def on_replay(self, trainer: "Trainer") -> None:
         """`trainer.row` is a row of metrics.jsonl that a resumed run has up to its checkpoint; called for each."""
@@ -66,7 +66,7 @@ class Callback:
     def on_fit_start(self, trainer: "Trainer") -> None:
         """The loop is about to start; a stop requested here ends it before any car drives.
 
-        What is entered into `trainer.running` here is left once the loop has ended, however it ended.
+        Contexts entered into `trainer.running` here are left once the loop has ended, however it ended.
         """
 
     def on_iteration_end(self, trainer: "Trainer") -> None:
@@ -82,11 +82,11 @@ class Callback:
         """Another process has taken the run over: write nothing more. In place of `on_run_end`."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what a resumed run needs: tensors, arrays and JSON types, under keys no other callback uses."""
+        """Return the state for a resumed run: tensors, arrays and JSON types, under keys no other callback uses."""
         return {}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore from what all callbacks of the run have stored."""
+        """Restore from the state of all callbacks of the run."""
 
     def summary(self, trainer: "Trainer") -> dict[str, Any]:
         """Return entries for summary.json, JSON types."""
@@ -102,8 +102,7 @@ class Trainer:
         folder: the run's folder.
         callbacks: in the order in which they are called.
         networks: policy and value.
-        agent: what improves them.
-        rivals: what its cars race against; None: they are alone.
+        agent: the algorithm. rivals: of its cars; None: they are alone.
         metrics: episodes and laps so far.
         budget: the limits and how much of them is used.
         checkpoints: the run's own.
@@ -126,7 +125,7 @@ class Trainer:
         config: Mapping[str, Any],
         callbacks: Sequence[Callback],
     ):
-        """Build the networks and all that trains them.
+        """Build networks, algorithm and metrics.
 
         `config` are all values, as in config.yaml; the callbacks are called in their order.
 
@@ -236,7 +235,7 @@ class Trainer:
                 is_fastest = self._laps_fastest()
                 self._write_trace(rows)
                 self._check_interruption()
-                # After the evaluation, which thus raced against those that the policy has learned to beat.
+                # After the evaluation, whose rivals are thus those of the training so far.
                 if self.rivals is not None and self.rivals.take(self.iteration):
                     collector.publish_rivals(self.rivals.driving)
 
@@ -273,7 +272,7 @@ class Trainer:
         return True
 
     def _write_trace(self, rows: NDArray[np.float64]) -> None:
-        """Write the steps of an iteration, and where the others around them were."""
+        """Write the steps of an iteration, with the placements of boxes, bots and rivals."""
         if self._trace is None:
             return
         extra, rows = rows[:, len(PACKED) :], rows[:, : len(PACKED)]
@@ -321,7 +320,7 @@ class Trainer:
     def load(self, checkpoint: Path, state: Mapping[str, Any]) -> None:
         """Restore a run from a checkpoint.
 
-        `state` is what `read_training` found in it.
+        `state` is the result of `read_training`.
 
         Raises:
             BadInput: it does not fit the experiment.
@@ -389,7 +388,7 @@ class Trainer:
         return self.end(Ending(FAILED, reason), exit_code, error)
 
     def release(self) -> None:
-        """Leave the run to the process that continues it: nothing more is written into its folder."""
+        """Hand the run over to the process that continues it: nothing more is written into its folder."""
         self._call("on_release")
         self.folder.release()
 
