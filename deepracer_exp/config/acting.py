@@ -1,8 +1,8 @@
-"""Values that act: those that run code or a program, or decide where something is sent.
+"""Acting values: those that run code or a program, or decide where data is sent.
 
-One rule decides which of them a command takes over from a stored run, a study or a trial: those that its user names
-now, on the command line, in an option file or in a script, and those that a run or study of this account has used
-before. Code counts by its contents, everything else by its text. docs/security.md explains it to users.
+A command takes over only these from a stored run, study or trial: those that its user names now, on the command line,
+in an option file or in a script, and those that a run or study of this account has used before. Code is identified by
+its contents, everything else by its text. docs/security.md explains it to users.
 """
 
 import contextlib
@@ -21,7 +21,7 @@ from deepracer_exp.files import read_bytes
 
 REWARD = "reward.file"
 _PLAIN_TRACKING = {"kind": "mlflow", "uri": None}
-"""Taken in place of a stored tracking that is not the user's own."""
+"""Replaces a stored tracking that is not the user's own."""
 _named: dict[str, str] = {}
 """Values that this command's user has named: the text of each value, and its mark in the record of this account."""
 
@@ -92,23 +92,23 @@ def reward_file(file: str) -> Acting:
 
 
 def name(values: Sequence[Acting]) -> None:
-    """Note that the user names these values now."""
+    """Record that the user names these values now."""
     for value in values:
         _named[f"{value.key}={value.text}"] = value.mark
 
 
 def named() -> dict[str, str]:
-    """Return what was named in this process, for `take_over_named` in one that works for it."""
+    """Return the values named in this process, for `take_over_named` in a worker."""
     return dict(_named)
 
 
 def take_over_named(values: Mapping[str, str]) -> None:
-    """Take over what was named in the process that this one works for."""
+    """Take over the values named in the parent process."""
     _named.update(values)
 
 
 def remember() -> None:
-    """Record for this account what was named, once a run or a study has begun with it."""
+    """Record the named values for this account, once a run or a study has begun with them."""
     record = _record()
     if record is None or not _named:
         return
@@ -120,7 +120,7 @@ def remember() -> None:
 
 
 def leave_out_foreign(config: dict[str, Any], where: str) -> list[str]:
-    """Leave out of a stored configuration what acts and is not the user's own; return a line for each such value.
+    """Remove foreign acting values from a stored configuration; return a line for each of them.
 
     The configuration is changed in place; `where` says in the lines what stores it.
 

@@ -18,7 +18,7 @@ Natural = Annotated[int, Field(ge=0, le=10**12)]
 UpTo100 = Annotated[int, Field(ge=1, le=100)]
 UpTo1000 = Annotated[int, Field(ge=1, le=1000)]
 FEWEST_ACTIONS, MOST_ACTIONS = 6, 100
-"""Actions that a list made of laps can have: at most five are added to recover with."""
+"""Length of an action list made from laps: at most five actions are added for recovery."""
 ActionCount = Annotated[int, Field(ge=FEWEST_ACTIONS, le=MOST_ACTIONS)]
 Seconds = Annotated[float, Field(gt=0, le=7 * 86400, allow_inf_nan=False)]
 """A waiting time, up to a week."""

@@ -36,7 +36,7 @@ from .track_options import GROUP as TRACK
 Config = TypeVar("Config")
 
 MOST_RUNS = 1000
-"""Limit of one `-m`: so many runs, one after the other, take a day."""
+"""Limit of one `-m`: this many runs in sequence take a day."""
 
 _FILES = (".json", ".npy", ".py", ".yaml", ".yml")
 _NO_EXPERIMENT = ("experiment", None)
@@ -52,7 +52,7 @@ class Composition:
     mapping: dict[str, Any]
     """All values, as plain Python."""
     notes: tuple[str, ...] = ()
-    """What was used of `custom_files` and what was not, a line each."""
+    """Notes on the use of each file of `custom_files`, a line each."""
     names: Mapping[str, str] = field(default_factory=dict)
     """Display names of the choices that come from `custom_files`, by group."""
 
@@ -70,7 +70,7 @@ def compose_experiment(overrides: Sequence[str], *, stored: bool = False) -> tup
         overrides: Hydra override expressions without sweeps, e.g. ``track=Oval_track``; paths and addresses need
             no quotes. ``custom_files=DIR`` uses the values of DeepRacer's files in a folder; they override defaults and
             experiments, and every other override has priority over them.
-        stored: whether a study holds them; the user's own words otherwise.
+        stored: whether they come from a stored study, not from the user.
 
     Raises:
         BadInput: an override cannot be parsed, names something unknown or gives a value that is not accepted; or code
@@ -87,7 +87,7 @@ def compose_experiment(overrides: Sequence[str], *, stored: bool = False) -> tup
 
 
 def trusted(composition: Composition, *, stored: bool) -> Composition:
-    """Allow what acts among composed values, which the user has named; of a study's values leave out what is foreign.
+    """Allow the acting values that the user has named; leave the foreign ones out of a study's values.
 
     `stored` is as of `compose_experiment`.
     """
@@ -151,7 +151,7 @@ def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
 
 
 def _leave_out_of_other_algorithm(config: DictConfig, choices: Mapping[str, str]) -> list[str]:
-    """Leave out what a chosen experiment sets for PPO where SAC is chosen beside it; return a line that names it."""
+    """Drop the PPO values of a chosen experiment where SAC is chosen; return a line that names them."""
     experiment, algorithm = choices.get("experiment"), config.get("algorithm")
     if experiment is None or algorithm is None or "replay_steps" not in algorithm:
         return []
@@ -190,7 +190,7 @@ def compose_option(group: str, option: str, kind: type[Config]) -> Config:
 def check_option(group: str, name: object, key: str | None = None) -> None:
     """Refuse a name that is not an option of the group, so that a name never becomes a path.
 
-    `key` is what it was given for, if that is not the group.
+    `key` is the key that was set, if that is not the group.
 
     Raises:
         BadInput: there is no such option.
@@ -279,13 +279,13 @@ def _dotted(node: Any, prefix: str = "") -> Iterable[str]:
 
 
 def _is_taken_for_a_group(config: DictConfig, override: Override) -> bool:
-    """Return whether a word is given for a section of several keys that has no options here."""
+    """Return whether a single word is assigned to a section of keys that has no options."""
     key = override.key_or_group
     return "." not in key and isinstance(config.get(key), DictConfig) and isinstance(override.value(), str)
 
 
 def _unknown_key(entry: str, key: str, config: DictConfig, choices: Mapping[str, str]) -> str:
-    """Return why a key is unknown among composed values."""
+    """Return the message for an unknown key, with the nearest known ones."""
     if "/" in key:
         return f"no such group{nearest(key, groups(entry))}; groups: {', '.join(groups(entry))}"
     parent, _, leaf = key.rpartition(".")

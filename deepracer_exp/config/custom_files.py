@@ -31,7 +31,7 @@ SIMILAR = {
     "model_metadata.json": "*metadata*.json",
     "hyperparameters.json": "*hyper*param*.json",
 }
-"""Other names under which racers keep these files: one that is alone is used, several are named."""
+"""Other names under which racers keep these files: a single match is used, several are listed in a message."""
 
 CARS = {4: "deepracer_v4", 5: "deepracer_v5", 6: "deepracer_v6"}
 """Our cars by simulation version."""
@@ -61,7 +61,7 @@ SAC_DIFFERS = (
     "SAC: sac_alpha is where the temperature begins (the service keeps it: algorithm.learn_alpha=false); iterations, "
     "replay and gradient steps are those of algorithm=sac"
 )
-"""What a training with the service's SAC files does otherwise than the service."""
+"""Differences between a training with the service's SAC files here and on the service."""
 
 FRAMES = "algorithm.frames_per_iteration"
 """Our alternative length of an iteration; null where the file's number of episodes is used."""
@@ -105,7 +105,7 @@ class CustomFiles:
     job: JobSettings | None = None
     """Track, starts and race of run.env; None without."""
     left: Mapping[str, "Left"] = field(default_factory=dict)
-    """What is not used of files with similar names, by the name in PLACES."""
+    """Unused files with similar names, by the name in PLACES."""
     unused: tuple[str, ...] = ()
     """A line for each folder `experiments/NAME` of deepracer-for-cloud, none of which is used."""
 
@@ -141,19 +141,19 @@ class CustomFiles:
 
     @property
     def is_sac(self) -> bool:
-        """Return whether they are of a training with SAC: by the metadata, without it by the exploration of SAC."""
+        """Return whether the files belong to a training with SAC: by the metadata, or else by SAC's exploration."""
         if self.metadata is not None:
             return self.metadata.training_algorithm == "sac"
         return self.hyperparameters is not None and self.hyperparameters.exploration_type == "additive_noise"
 
     @property
     def taken(self) -> Mapping[str, str]:
-        """Return the keys of hyperparameters.json that are used, and ours for the same values."""
+        """Return the used keys of hyperparameters.json, with our keys for the same values."""
         return SAC_TAKEN if self.is_sac else TAKEN
 
     @property
     def learning(self) -> dict[str, Any]:
-        """Return the values that are used, by key of hyperparameters.json; empty without the file."""
+        """Return the used values by key of hyperparameters.json; empty without the file."""
         settings = self.hyperparameters
         if settings is None:
             return {}
@@ -206,7 +206,7 @@ class CustomFiles:
 
 
 def sensor_overrides(metadata: ModelMetadata) -> list[str]:
-    """Return the overrides with which a policy sees what the sensors of a model do."""
+    """Return the overrides that give a policy a model's sensors."""
     stereo = "STEREO_CAMERAS" in metadata.sensor
     lidar = next((name for name in metadata.sensor if name in LIDARS), None)
     if lidar is None:

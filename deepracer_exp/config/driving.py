@@ -86,7 +86,7 @@ class CameraConfig:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Channels, height and width of what the policy sees."""
+        """Channels, height and width of the policy's pictures."""
         channels = (3 if self.color == "rgb" else 1) * (2 if self.stereo_m else 1) * self.frames
         return channels, self.height, self.width
 
@@ -121,7 +121,7 @@ class LidarConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class ObservationConfig:
-    """What is observed: the features, each divided by its scale, the pictures of a camera, and a LIDAR."""
+    """The observation: the features, each divided by its scale, the pictures of a camera, and a LIDAR."""
 
     lookahead_m: Annotated[tuple[Positive, ...], Field(max_length=1000)]
     lookahead_scale_m: Divisor
@@ -135,7 +135,7 @@ class ObservationConfig:
 
 
 class ObservationShape(NamedTuple):
-    """What networks are built for."""
+    """The inputs that networks are built for."""
 
     features: int
     picture: tuple[int, int, int] | None = None
@@ -211,7 +211,7 @@ JpegQuality = Annotated[int, Field(ge=1, le=100)]
 
 @dataclass(frozen=True, kw_only=True)
 class PictureRandomizationConfig:
-    """What pictures differ in: the lowest and highest value of each quantity, drawn for each episode of each car."""
+    """Randomization of pictures: the lowest and highest value of each quantity, drawn for each episode of each car."""
 
     brightness_scale: Range[Scale] = (1.0, 1.0)
     contrast_scale: Range[Scale] = (1.0, 1.0)
@@ -253,7 +253,7 @@ class CarControlsRanges:
 
 @dataclass(frozen=True, kw_only=True)
 class CarRandomizationConfig:
-    """How far cars see and act as the physical car, drawn for each episode; a part that is null is the simulator's."""
+    """Similarity to the physical car, drawn for each episode; a part that is null is as in the simulator."""
 
     picture: CarPictureRanges | None = None
     timing: CarTimingRanges | None = None
@@ -281,11 +281,11 @@ class RandomizationConfig:
     pictures: PictureRandomizationConfig | None = None
     real_car: CarRandomizationConfig | None = None
     car_share: Fraction = 1.0
-    """Share of the cars that differ; the others have no randomization."""
+    """Share of the cars that are randomized."""
 
 
 _OTHER_KEYS = ("pictures", "real_car", "car_share")
-"""Keys of `RandomizationConfig` that are no range; what they draw is not in the trace."""
+"""Keys of `RandomizationConfig` that are not ranges; their draws are not in the trace."""
 QUANTITIES = tuple(field.name for field in fields(RandomizationConfig) if field.name not in _OTHER_KEYS)
 OFF = {name: 1.0 if name.endswith("_scale") else 0.0 for name in QUANTITIES}
 """The value of each quantity that has no effect."""

@@ -26,14 +26,14 @@ class PenaltyConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class CarPictureConfig:
-    """How the car turns its camera's 640x480 into what a model sees."""
+    """The car's conversion of 640x480 camera frames to a model's pictures."""
 
     jpeg_quality: JpegQuality | None
 
 
 @dataclass(frozen=True, kw_only=True)
 class CarTimingConfig:
-    """When the car sees and acts."""
+    """Timing of the car's frames and commands."""
 
     frames_per_s: Annotated[float, Field(ge=5, le=60, allow_inf_nan=False)]
     latency_s: Latency
@@ -41,7 +41,7 @@ class CarTimingConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class CarControlsConfig:
-    """What the car makes of actions, see `aws.models.car_controls`."""
+    """The car's response to actions, see `aws.models.car_controls`."""
 
     full_lock_deg: FullLock
     full_throttle_mps: Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)] | None
@@ -49,7 +49,7 @@ class CarControlsConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class RealCarConfig:
-    """How the physical car sees and acts; a part that is null is as in the simulator."""
+    """The physical car's camera, timing and controls; a part that is null is as in the simulator."""
 
     picture: CarPictureConfig | None
     timing: CarTimingConfig | None
@@ -58,7 +58,7 @@ class RealCarConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationConfig:
-    """What a trial is, how many there are, and on which tracks and conditions."""
+    """The protocol: kind and number of trials, tracks and conditions."""
 
     laps: UpTo1000 | None
     time_s: Seconds
@@ -85,7 +85,7 @@ class StoreConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateConfig:
-    """The request of `deepracer-exp evaluate`: how to race, which checkpoint, and where its run is looked up."""
+    """The request of `deepracer-exp evaluate`: protocol, checkpoint, and where to look up the run."""
 
     evaluation: EvaluationConfig
     checkpoint: Annotated[str, Field(min_length=1)] | None
@@ -96,7 +96,7 @@ class EvaluateConfig:
     debug: bool
 
     def __post_init__(self) -> None:
-        """Refuse a checkpoint of no rival."""
+        """Refuse a rival's checkpoint without a rival."""
         if self.rival_checkpoint is not None and self.rival is None:
             raise ValueError(
                 f"rival_checkpoint={self.rival_checkpoint}: of which run? accepted: with rival=RUN, or null"

@@ -48,7 +48,7 @@ def _device(name: str) -> str:
 
 
 def _off(kept: object) -> object:
-    """Take YAML's `off`, which is false there, as the word."""
+    """Read YAML's `off`, which YAML takes for false, as the word."""
     return "off" if kept is False else kept
 
 
@@ -140,7 +140,7 @@ class Experiment:
             )
 
     def _check_sac(self) -> None:
-        """Refuse what soft actor-critic cannot do."""
+        """Refuse values that soft actor-critic does not support."""
         if isinstance(self.lr_schedule, AdaptiveKLLR):
             raise ValueError(
                 "lr_schedule=adaptive_kl: follows PPO's change of the policy, which SAC does not measure; accepted: "

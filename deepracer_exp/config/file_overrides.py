@@ -14,7 +14,7 @@ from .overrides import first_given, key_of, override_line, parse_single
 
 @dataclass(frozen=True)
 class FileOverrides:
-    """Overrides of the user's, and those that a folder of files stands for."""
+    """The user's overrides, and those derived from a folder of files."""
 
     typed: tuple[str, ...]
     """The user's own, with `custom_files=DIR`."""
@@ -23,7 +23,7 @@ class FileOverrides:
     names: Mapping[str, str]
     """Display names of the reward and the action space that come from the folder."""
     notes: tuple[str, ...]
-    """What was used, and what was not and why, a line each."""
+    """Each used file, and each unused one with the reason, a line each."""
 
 
 def with_custom_files(overrides: Sequence[str]) -> FileOverrides:
@@ -150,4 +150,4 @@ _CHOSEN_BY = {
     "model_metadata.json": ("action_space", "action_space.file"),
     "hyperparameters.json": ("algorithm", "algorithm"),
 }
-"""The user's own overrides that stand for a file."""
+"""Overrides of the user that take precedence over a file."""

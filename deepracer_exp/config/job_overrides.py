@@ -12,9 +12,9 @@ from .job_race import race_overrides
 from .overrides import first_given, override_line
 
 _SECOND_CAR = ("HEAD_TO_MODEL", "F1")
-"""Types of race against models of others; the service takes their number from elsewhere."""
+"""Types of race against other models, whose number the service reads elsewhere."""
 _DEFAULT_ADVANCE = 0.05
-"""The service's, where the start changes and the file does not say by how much."""
+"""The service's default, where the start advances and the file gives no amount."""
 _NOT_APPLICABLE = {
     r"DR_TRAIN_(MIN_EVAL|BEST|MAX_STEPS|RTF)|MIN_EVAL_TRIALS|BEST_MODEL_METRIC": "not applicable: how the service "
     "evaluates and batches; here values of evaluation, checkpoints and algorithm",
@@ -23,7 +23,7 @@ _NOT_APPLICABLE = {
     r"DR_H2B_": "not read, because DR_RACE_TYPE is not HEAD_TO_BOT",
     r"": "no effect on a training here: names, colours, places and parts of the service",
 }
-"""Keys that have no effect here, the first pattern that matches, and why."""
+"""Patterns of keys without effect here, with the reason; the first match counts."""
 
 
 def job_overrides(job: JobSettings, typed: Mapping[str, str]) -> tuple[list[str], list[str]]:

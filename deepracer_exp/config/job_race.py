@@ -94,9 +94,9 @@ def race_overrides(job: JobSettings, typed: Mapping[str, str]) -> tuple[list[str
 
 
 def recorded_race(values: Mapping[str, str]) -> RaceConfig | None:
-    """Return the boxes and bots of a recording whose places its parameters say.
+    """Return the boxes and bots of a recording if its parameters determine their places.
 
-    They do of boxes at given positions, and of bots that begin at the same places in every episode and stay in their
+    They do for boxes at given positions, and for bots that begin at the same places in every episode and stay in their
     lanes; the distance by which the service spreads other boxes depends on its version.
 
     Args:

@@ -8,7 +8,7 @@ from pydantic import Discriminator, Field, Tag
 from .bounds import Fraction, NonNegative, Positive, UpTo1000
 from .own_class import OURS_OR_OWN, OwnClass, Reference
 
-# Eight layers of so many take seconds to begin with; of twice as many, minutes.
+# Eight layers of this size take seconds to build; of twice the size, minutes.
 Units = Annotated[int, Field(ge=1, le=2048)]
 Steps = Annotated[int, Field(ge=1, le=10**7)]
 By = Literal["iteration", "fraction"]
@@ -75,7 +75,7 @@ NetworkConfig = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class AlgorithmConfig:
-    """What every algorithm has: the hyperparameters of a gradient step, and the length of an iteration."""
+    """The hyperparameters of every algorithm: gradient step and length of an iteration."""
 
     lr: Positive
     batch_size: Annotated[int, Field(ge=1, le=10**6)]
@@ -88,7 +88,7 @@ class AlgorithmConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class PPOConfig(AlgorithmConfig):
-    """Clipped PPO, its hyperparameters by the meaning DeepRacer gives them; or an algorithm of your own with them."""
+    """Clipped PPO, whose hyperparameters mean what they do in DeepRacer; or an algorithm of your own with them."""
 
     epochs: UpTo1000
     gae_lambda: Fraction

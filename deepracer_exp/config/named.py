@@ -1,4 +1,4 @@
-"""Parts of an experiment that something else names by their option: a protocol, a recording, a model of the service."""
+"""Options that a protocol, a recording or a model of the service refers to by name."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -95,6 +95,6 @@ def network_overrides(metadata: ModelMetadata) -> list[str]:
 
 
 def _differing(metadata: ModelMetadata) -> dict[str, Any]:
-    """Return what the network has instead of its option's values."""
+    """Return the values in which a network differs from its option."""
     is_shallow = metadata.neural_network == NEURAL_NETWORKS[0]
     return dict(_STEREO) if "STEREO_CAMERAS" in metadata.sensor and not is_shallow else {}

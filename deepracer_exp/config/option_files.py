@@ -83,7 +83,7 @@ class OptionFiles(ConfigSource):
 
     @staticmethod
     def scheme() -> str:
-        """Return what stands before a folder in Hydra's search path."""
+        """Return the prefix of a folder in Hydra's search path."""
         return "options"
 
     def load_config(self, config_path: str) -> ConfigResult:
@@ -223,7 +223,7 @@ def change(config: DictConfig, override: Override) -> bool:
         above, _, leaf = key.rpartition(".")
         with open_dict(config):
             del (OmegaConf.select(config, above) if above else config)[leaf]
-    except (AttributeError, KeyError, TypeError):  # OmegaConf's are such, too
+    except (AttributeError, KeyError, TypeError):  # OmegaConf's mappings and lists are such, too
         return False
     return True
 

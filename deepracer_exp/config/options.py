@@ -73,7 +73,7 @@ def sweep_files() -> dict[str, Path]:
 
 
 def option_files() -> tuple[FileState, ...]:
-    """Return all files of options, and those of studies, with what changes when they do.
+    """Return all option and study files, with stamps that change with them.
 
     Raises:
         BadInput: as `conf_dirs`.

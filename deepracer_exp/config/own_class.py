@@ -24,7 +24,7 @@ from . import acting
 GROUPS = ("network", "algorithm", "lr_schedule", "observation", "stopping", "tracking")
 """Groups whose option may be a class of your own. Entry points are registered under `deepracer_exp.GROUP`."""
 OF_POLICY = ("network", "observation")
-"""Those that a stored policy needs, in an evaluation or an export."""
+"""Groups that a stored policy needs in an evaluation or an export."""
 REFERENCE = r"[A-Za-z_][\w.]*:[A-Za-z_]\w*"
 Reference = Annotated[str, Field(pattern=rf"^{REFERENCE}$")]
 _GIVEN = re.compile(rf"(?:{'|'.join(GROUPS)})\.target=({REFERENCE})")
@@ -73,7 +73,7 @@ def registered(group: str) -> dict[str, str]:
 
 
 def allow(values: Any) -> None:
-    """Note that the user's own command or option files name what acts among these values: classes and the rest."""
+    """Record the acting values, classes included, that the user's command or option files name."""
     acting.name([*map(acting.class_of, _references(values)), *acting.acting(values)])
 
 

@@ -101,7 +101,7 @@ class RivalsConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class RaceConfig:
-    """The others on the track."""
+    """The other cars and boxes on the track."""
 
     boxes: BoxesConfig
     bots: BotsConfig
@@ -109,7 +109,7 @@ class RaceConfig:
     rivals: RivalsConfig | None = None
 
     def __post_init__(self) -> None:
-        """Refuse bots beside a rival: the two cars would not meet them at the same places once one had stopped them."""
+        """Refuse bots beside a rival: once one car stops them, the two cars would meet them at different places."""
         if self.rivals is not None and self.bots.count:
             raise ValueError(
                 f"rivals: race without bots, and there are {self.bots.count}; accepted: bots.number=0, or rivals=null"
@@ -134,4 +134,4 @@ ALONE = RaceConfig(
     ),
     quirks="fixed",
 )
-"""The race of runs that were stored before there were others."""
+"""The race of runs stored before races had boxes, bots or rivals."""

@@ -15,7 +15,7 @@ _FEWEST_CARS = 4
 
 @dataclass(frozen=True, kw_only=True)
 class CollectorConfig:
-    """Where experience is collected."""
+    """The collection of experience: in this process or in workers."""
 
     mode: Literal["in_process", "sync"]
     processes: UpTo1000 | None
@@ -97,6 +97,6 @@ class BudgetConfig:
     schedule_until: Positive = 1.0
 
     def __post_init__(self) -> None:
-        """Refuse a run without an end."""
+        """Refuse a budget without any limit."""
         if self.env_steps is None and self.iterations is None and self.minutes is None:
             raise ValueError("env_steps, iterations and minutes are all null; at least one must end the run")

@@ -22,8 +22,8 @@ class NoStopping:
 class ReliableStopping:
     """Stop once the car drives reliably: it completed a share of the last episodes, or of the last evaluated laps.
 
-    `held_out_completion`, per cent of the lap, is the mean that these evaluations must reach besides on conditions held
-    out of the training.
+    `held_out_completion`, per cent of the lap, is the mean that these evaluations must also reach under held-out
+    conditions.
     """
 
     kind: Literal["reliable"]

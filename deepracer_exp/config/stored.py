@@ -30,7 +30,7 @@ def with_overrides(
         config: all values, as in config.yaml.
         choices: the options the values came from, by group.
         overrides: of whole groups (``track=Oval_track``), which are composed again, and of single values.
-        stored: whether a study holds the overrides; the user's own words otherwise.
+        stored: whether the overrides come from a stored study, not from the user.
 
     Returns:
         The changed values; a note for each value that was left out and is not among the overrides.
@@ -85,13 +85,13 @@ def with_overrides(
 
 @dataclass(frozen=True)
 class EvaluationRequest:
-    """An evaluation of a stored run, as asked for."""
+    """The requested evaluation of a stored run."""
 
     config: EvaluateConfig
     """All values; the protocol is the run's unless one is named."""
     composition: Composition
     changes: tuple[str, ...] | None
-    """Overrides of the run's protocol, such as ``evaluation.trials=20``; None: a protocol is named."""
+    """Overrides of the run's protocol, such as ``evaluation.trials=20``; None: another protocol is named."""
 
     def of_run(self, protocol: EvaluationConfig) -> EvaluateConfig:
         """Return the request for a run that its training evaluates by a protocol.

@@ -108,7 +108,7 @@ class SweepConfig:
 
     @property
     def clone_overrides(self) -> list[str]:
-        """Return the overrides of the clone of the best trial; none where there is no clone."""
+        """Return the overrides of the clone of the best trial; empty without a clone."""
         return [override_line(key, value) for key, value in (self.clone or {}).items()]
 
 
@@ -137,7 +137,7 @@ class SweepRequest:
     """Keys of the space of `sweep=NAME` whose group the command line sets: they are dropped where the chosen options do
     not have them."""
     stored: bool = False
-    """Whether the overrides are those that a study holds; the user's own words otherwise."""
+    """Whether the overrides come from a stored study, not from the user."""
 
     @property
     def study(self) -> str:

@@ -21,11 +21,11 @@ from .track import TrackConfig
 GROUP = "track"
 ALL = "all"
 BASE = "reinvent_base"
-"""The option with the default values of all others."""
+"""The option whose values are the defaults of all others."""
 
 # Meshes and textures of the service's worlds (deepracer-simapp, `bundle/meshes`), the first pattern that matches; those
-# of 2018 have colours of their own. Walls of 9.14 m (30 ft) and 0.76 m beyond the road are of the generated worlds; of
-# worlds whose meshes are in many files we know less.
+# of 2018 have colours of their own. Walls of 9.14 m (30 ft) and 0.76 m beyond the road are of the generated worlds;
+# less is known of worlds whose meshes are spread over many files.
 _OF_2018 = re.compile(r"reinvent_")
 _LATER_FLOOR: dict[str, Any] = {
     "road_color": "#403f3d",
