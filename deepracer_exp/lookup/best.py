@@ -1,4 +1,4 @@
-"""The best run of an experiment, and best_of_sweep.json, which names that of a sweep."""
+"""The best run of an experiment, and best_of_sweep.json, which names the best run of a sweep."""
 
 import json
 from collections.abc import Mapping
@@ -26,9 +26,9 @@ from deepracer_exp.runs.result import RunResult, read_result
 def best_of(experiment: str, runs_dir: Path) -> Path:
     """Return the folder of an experiment's best run.
 
-    Of a sweep it is the run of its best trial, whatever else was trained under the same name. Otherwise runs whose
-    best checkpoint was evaluated are ranked by that; where none was, by the share of complete exploring laps
-    and the fastest of them. The newest of equals is taken, and a single run without results, such as an imported model.
+    For a sweep it is the run of the best trial, whatever else was trained under the same name. Otherwise runs whose
+    best checkpoint was evaluated are ranked by that; where none was, by the share of complete exploring laps and the
+    fastest of them. The newest of equals is taken. A single run needs no result, such as an imported model.
 
     Raises:
         BadInput: there is no such experiment, none of its runs has a result, they cannot be ranked (another car,
@@ -132,7 +132,7 @@ def _check_comparable(what: str, results: Mapping[Path, RunResult]) -> None:
 
 
 def _terms(config: Mapping[str, Any], result: RunResult) -> dict[str, Any]:
-    """Return what must be the same for ranks to compare."""
+    """Return the values that must be equal for ranks to be comparable."""
     evaluation = config.get("evaluation") or {}
     courses = evaluation.get("tracks") if result.evaluated else None
     return {

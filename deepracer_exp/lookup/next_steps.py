@@ -1,4 +1,4 @@
-"""What came of a run, and what to do next with it, as commands to paste."""
+"""The results of a run, and next steps as commands to paste."""
 
 import contextlib
 import math
@@ -36,15 +36,15 @@ from deepracer_exp.tracks.boards import standings, what_it_sees
 
 COMMAND = "deepracer-exp"
 SECOND_PHASE = "randomization=sim2real budget.env_steps=1000000"
-"""Overrides of the clone that makes a fast car a stable one."""
+"""Overrides of a clone that turns a fast policy into a stable one."""
 FURTHER = "train it further, at a tenth of the learning rate"
 STABLE = "make it stable: train it further on changing conditions, at a tenth of the learning rate"
 _RUNS = Path("runs")
-"""Where commands look for runs by themselves."""
+"""The default folder of runs in commands."""
 
 
 def outcome(run: RunRecord) -> list[tuple[str, str]]:
-    """Return what was driven, how good the best policy is in evaluation and the run's state, in names and values.
+    """Return the amount of driving, the best policy's evaluation and the run's state, as names and values.
 
     Raises:
         BadInput: its summary.json is not what a training writes.
@@ -84,7 +84,7 @@ def outcome(run: RunRecord) -> list[tuple[str, str]]:
 
 
 def official_place(run: RunRecord) -> str | None:
-    """Return where the mean of the evaluated laps would stand on the official board of a run's track, in words.
+    """Return in words the rank of the mean evaluated lap on the official board of a run's track.
 
     None: there is no complete lap, the run has several tracks or others on the road, its laps are those of the physical
     car, or its track has no board or is driven the other way.
@@ -168,7 +168,7 @@ def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         words = [f"budget.{key}={twice}" for key, (_, twice) in again.items()]
         what = "continue it for as long again"
         if held := _rates_that_follow(config):
-            # Where the schedules were when the limits were reached, whatever was used until the run had ended.
+            # The schedules' position when the limits were reached, not that of the somewhat later end.
             until = config["budget"].get("schedule_until", 1.0)
             words.append(schedule_until(until * min(most / float(twice) for most, twice in again.values())))
             what += f", holding {' and '.join(held)}"
@@ -183,7 +183,7 @@ def schedule_until(share: float) -> str:
 
 
 def _rates_that_follow(config: Mapping[str, Any]) -> list[str]:
-    """Return names of what the share of the budget decides in a run of ours."""
+    """Return the names of the values that follow the budget in a run of ours."""
     names = []
     schedule, algorithm = config.get("lr_schedule") or {}, config.get("algorithm") or {}
     if schedule.get("kind") != "constant" and schedule.get("by", "fraction") == "fraction":
@@ -210,7 +210,7 @@ def command_line(command: str, word: str, config: Mapping[str, Any], groups: Seq
 
 
 def run_word(run: Path) -> str:
-    """Return what a run is called on the command line: `best:EXPERIMENT` if it is that, else as `own_word` says."""
+    """Return a run's name for the command line: `best:EXPERIMENT` if it is that, else `own_word`."""
     if _is_in_runs(run):
         with contextlib.suppress(BadInput):  # its experiment may have no best run
             if best_of(run.parent.name, _RUNS).resolve() == run.resolve():
@@ -219,7 +219,7 @@ def run_word(run: Path) -> str:
 
 
 def own_word(run: Path) -> str:
-    """Return what a run will be called on the command line whatever is trained later: its folder.
+    """Return a run's permanent name for the command line: its folder.
 
     The folder's name may be that of another run, too, which begins in the same second, or in the hour that summer time
     repeats.

@@ -1,4 +1,4 @@
-"""Which run a name, an id, `best:EXPERIMENT` or a registered alias stands for, and which checkpoint of it is meant."""
+"""Resolve a name, an id, `best:EXPERIMENT` or a registered alias to a run and its checkpoint."""
 
 import logging
 from dataclasses import dataclass, replace
@@ -46,11 +46,11 @@ class StoredRun:
 
     path: Path
     checkpoint: str | None = None
-    """Name of the checkpoint that is meant: `best`, `last`, `fastest` or an iteration; None: not chosen."""
+    """Name of the chosen checkpoint: `best`, `last`, `fastest` or an iteration; None: not chosen."""
     was_never_evaluated: bool = False
     """Whether the checkpoint is `last` only because the run ended before it had a best one."""
     registered: str | None = None
-    """That alias, as MODEL@ALIAS."""
+    """The registered alias of the checkpoint, as MODEL@ALIAS."""
 
     @cached_property
     def experiment(self) -> Experiment:

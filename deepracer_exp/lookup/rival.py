@@ -1,4 +1,4 @@
-"""The run whose policy drives the rivals of a race head to head."""
+"""The run whose policy drives the rivals of a head-to-head race."""
 
 import shutil
 from pathlib import Path
@@ -19,9 +19,9 @@ def find_rival(
     runs_dir: Path,
     tracking_uri: str | None,
 ) -> StoredRun:
-    """Find a run and its checkpoint, whose policy has the actions of those that race against it.
+    """Find a rival's run and checkpoint; its policy must have the same actions.
 
-    With other actions not the better policy would win but the faster car. What it sees may differ.
+    With other actions, the faster car would win, not the better policy. Its observation may differ.
 
     Args:
         key: of the configuration, for messages.

@@ -21,9 +21,9 @@ COLUMNS = tuple(_DTYPES)
 """The keys that differ from car to car: one row per car, two numbers a row in `closest_waypoints`."""
 _WAYPOINTS_PLACE = COLUMNS.index("closest_waypoints")
 BATCH_COLUMNS = (*COLUMNS, "previous_progress")
-"""Columns of `reward_batch`, with the progress at the step before, which `reward_function` remembers by itself.
+"""Columns of `reward_batch`, with the progress at the last step, which a `reward_function` remembers by itself.
 
-Per cent of the lap; at the first step of an episode that is rewarded, the progress itself.
+It is in per cent of the lap; at an episode's first rewarded step, it is the progress itself.
 """
 
 
@@ -86,8 +86,8 @@ def row_keys(selected: Mapping[str, np.ndarray]) -> tuple[str, ...]:
 def scalar_params(row: Row, road: TrackParams, keys: tuple[str, ...] = COLUMNS) -> dict[str, Any]:
     """Build the 27 keys for one car.
 
-    Every list is a fresh one, so that nothing a reward function does to it reaches another call; the keys about other
-    objects that the row has not hold the defaults of an empty road (deepracer-simapp agent_ctrl/constants.py).
+    Every list is a new one, so that a reward function cannot change those of another call; the keys about other objects
+    that the row has not hold the defaults of an empty road (deepracer-simapp agent_ctrl/constants.py).
 
     Args:
         row: One tuple of `rows`; lengths in metres, angles in degrees, speeds in m/s, time in seconds.

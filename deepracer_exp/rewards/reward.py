@@ -1,4 +1,4 @@
-"""Calls reward functions for many cars: with a time limit, and checked."""
+"""Calls reward functions for many cars, with a time limit and checks."""
 
 import itertools
 import math
@@ -36,7 +36,7 @@ class RewardFailed(RunFailed):
     ) -> None:
         super().__init__(message)
         self.what = what
-        """Part of the message: what the function did, and in which line."""
+        """The function's mistake and its line, as part of the message."""
         self.params = params
         """The params of the call (`reward_batch`: of all cars, if the car is not known)."""
         self.car = car
@@ -227,9 +227,9 @@ class Failure:
     """A call of a reward function that failed."""
 
     what: str
-    """What the function did, and in which line."""
+    """The function's mistake and its line."""
     params: dict[str, Any]
-    """The params, as they were given."""
+    """The params of the call."""
     error: BaseException
 
     @property

@@ -1,4 +1,4 @@
-"""How the code of a reward function is run: its module, and the time limit of a block of its code."""
+"""Execution of reward code: its module, and a time limit for blocks of it."""
 
 import signal
 import threading
@@ -7,9 +7,9 @@ from types import CodeType, FrameType
 from typing import Any, Self
 
 _LOOKS = 4
-"""How often in the time of the limit it is looked whether it has passed."""
+"""Number of checks within the time limit."""
 _WAIT_FACTOR = 10
-"""Limit of waiting, such as in `sleep`, which uses no CPU, over the limit of CPU time."""
+"""Limit of waiting without CPU use, as in `sleep`, as a multiple of the limit of CPU time."""
 
 
 def run_module(code: CodeType, namespace: dict[str, Any]) -> None:

@@ -18,7 +18,7 @@ HASHES = "hashes.json"
 MANIFEST = "manifest.json"
 BEST = "best"
 LINKS = (BEST, "last", "fastest")
-"""Names of the best checkpoint, of the last one, and of the one that laps fastest of the reliable ones."""
+"""Names of the best checkpoint, the last one, and the fastest reliable one."""
 _PINNED = "pinned.json"
 _PINS = TypeAdapter(dict[str, list[str]])
 
@@ -46,7 +46,7 @@ def verify(folder: Path) -> None:
 
 
 def restore_links(folder: Path) -> None:
-    """Make the names of `LINKS` links again where a copy has followed them, or holds them as text.
+    """Restore the links `LINKS` where a copy has replaced them by folders or text.
 
     `cp -rL`, object stores and archives without links turn each into a second copy of its checkpoint. A folder that
     cannot be written stays as it is, and so does a copy that equals no checkpoint of another name.
@@ -117,7 +117,7 @@ def checkpoint_sha256(folder: Path) -> str:
 
 
 def pin(checkpoints: Path, name: str, why: str) -> None:
-    """Note that a checkpoint must stay.
+    """Pin a checkpoint, so that it stays.
 
     `name` is that of its own folder in `checkpoints/` of its run, e.g. ``000120``; `runs clean` shows `why`.
     """
@@ -129,7 +129,7 @@ def pin(checkpoints: Path, name: str, why: str) -> None:
 
 
 def pinned(checkpoints: Path) -> dict[str, list[str]]:
-    """Return the checkpoints that must stay, with the reasons.
+    """Return the pinned checkpoints, with the reasons.
 
     Raises:
         BadInput: their file cannot be read.

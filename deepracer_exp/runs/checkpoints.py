@@ -1,4 +1,4 @@
-"""Checkpoints of a run, kept and read safely: tensors and JSON only, never a pickle, never an incomplete one."""
+"""Checkpoints of a run: tensors and JSON only, never a pickle, and never left incomplete."""
 
 import contextlib
 import logging
@@ -26,7 +26,7 @@ from .files import CHECKPOINTS, REPLAY
 logger = logging.getLogger("deepracer_exp")
 
 AGENT, TRAINING = "agent", "training"
-"""Components: the networks with what improves them, and what a resumed training needs besides."""
+"""Components: the networks with their algorithm, and the further state of a resumed training."""
 _NO_RESUME = "a training cannot resume from it"
 
 
@@ -139,7 +139,7 @@ def read_agent(path: Path, agent: Algorithm) -> None:
 
 
 def read_training(path: Path) -> dict[str, Any]:
-    """Return what `CheckpointStore.save` was given as `training`.
+    """Return the `training` that `CheckpointStore.save` has stored.
 
     `path` is a checkpoint that `check` has accepted.
 
@@ -241,7 +241,7 @@ class CheckpointStore:
         self._drop_replays(checkpoint_name(iteration))
 
     def _drop_replays(self, last: str) -> None:
-        """Remove all replays but that of the checkpoint `last` and that of the one which a corrupt `last` leads to."""
+        """Remove all replays except those of the checkpoint `last` and of its substitute if `last` is corrupt."""
         kept = [path.name for path in self._numbered() if path.name <= last][-2:]
         for path in self._replays.glob("*"):
             if path.name not in kept:
@@ -256,7 +256,7 @@ class CheckpointStore:
     def _prune(self) -> None:
         numbered = self._numbered()
         kept = {str(path.readlink()) for path in self.folder.iterdir() if path.is_symlink()}
-        # That of the start is of no use once there is another.
+        # The checkpoint of the start is of no use once there is another.
         evaluated = [path.name for path in numbered if int(path.name) and int(path.name) % self._every == 0]
         kept |= {*evaluated[-self._keep :]} | pinned(self.folder).keys()
         for path in numbered:

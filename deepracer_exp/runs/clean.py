@@ -47,7 +47,7 @@ _UNKNOWN = (
 
 @dataclass(frozen=True)
 class StoreOverview:
-    """The runs and registered checkpoints of an MLflow store."""
+    """Runs and registered checkpoints of an MLflow store."""
 
     deleted: dict[str, bool]
     """Whether each run, by id, was deleted there."""
@@ -75,13 +75,13 @@ class Removables:
     kept: list[tuple[Path, str]] = field(default_factory=list)
     """Runs with something that must be kept for now, and why."""
     offered: list[Removable] = field(default_factory=list)
-    """Traces of finished runs and replays of ended ones, which are removed only where that is asked for."""
+    """Traces of finished runs and replays of ended ones, which are removed only on request."""
 
 
 def survey(runs_dir: Path, overview: StoreOverview | None) -> Removables:
     """Find what may be removed; nothing is changed.
 
-    Without `overview`, which is what MLflow knows, only the trace of a run that is recorded there may be removed.
+    Without `overview`, the data of MLflow, only the trace of a run that is recorded there may be removed.
 
     Raises:
         BadInput: a file that says what must be kept cannot be read.
@@ -167,7 +167,7 @@ def _search(
 
 
 def asked_traces(offered: Sequence[Removable], how: str | None) -> list[Removable]:
-    """Return what of the offered traces is to go: all of them (DROP), all but their newest part (THIN) or nothing."""
+    """Select traces to remove: all of them (DROP), all but their newest part (THIN) or nothing."""
     traces = [item for item in offered if item.what == WHOLE_TRACE]
     if how == DROP:
         return traces
@@ -175,7 +175,7 @@ def asked_traces(offered: Sequence[Removable], how: str | None) -> list[Removabl
 
 
 def replays(offered: Sequence[Removable]) -> list[Removable]:
-    """Return the offered replays."""
+    """Return removable replays."""
     return [item for item in offered if item.what == WHOLE_REPLAY]
 
 
@@ -196,7 +196,7 @@ def _early(item: Removable) -> Removable | None:
 
 
 def deletable(run: Path, runs_dir: Path) -> Removable:
-    """Return a whole run that someone asks to delete.
+    """Return a whole run, on request to delete it.
 
     Raises:
         BadInput: it is no folder of its own in `runs_dir`, is in progress, or another run or a registered model needs

@@ -84,10 +84,10 @@ class State:
 
 
 def load_component(path: Path, component: str, target: Any, problem: str) -> dict[str, Any]:
-    """Load a component into `target` and return the checkpoint's counters.
+    """Load a component into `target`; return the checkpoint's counters.
 
     Raises:
-        BadInput: it cannot be read, or `target` does not take it; `problem` says what that prevents.
+        BadInput: it cannot be read or does not fit `target`; `problem` names the consequence.
     """
     archive = Checkpoint().register(component, target, adapter=StateDictCheckpointAdapter("archive"))
     try:

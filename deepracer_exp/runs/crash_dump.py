@@ -37,7 +37,7 @@ def write_crash_dump(run_dir: Path, error: BaseException, worker: int | None = N
 
 
 def read_crash_dump(run_dir: Path, worker: int) -> str | None:
-    """Return the line a worker left behind, None where it left none."""
+    """Return the error line of a worker, None if it wrote none."""
     path = run_dir / CRASH_DUMPS / f"worker-{worker}.json"
     return str(read_json(path, "what a worker writes there")["message"]) if path.exists() else None
 

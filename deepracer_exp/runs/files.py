@@ -28,9 +28,9 @@ REPORT = "report.html"
 BEST_LAP = "best_lap.png"
 LEARNING = "learning.png"
 TRACKING = "tracking.json"
-"""What the training says to trackers."""
+"""The training's description of the run for trackers."""
 MLFLOW = "mlflow.json"
-"""What was recorded in MLflow."""
+"""The record's state in MLflow."""
 MACHINE_USE = "machine.jsonl"
 """Use of cores and memory, a row an iteration."""
 LABELS = "labels.json"
@@ -53,9 +53,9 @@ MLFLOW_DB = "mlflow.db"
 BEST = "best:"
 """Prefix of an experiment's name that means its best run."""
 WRITTEN = "what a run writes there"
-"""What is accepted as a file of a run's folder, for messages."""
+"""The accepted origin of a file in a run's folder, for messages."""
 RUN = "a run's folder, its name or the beginning of it, MLflow's id, best:EXPERIMENT, MODEL@ALIAS or ALIAS"
-"""The forms in which commands accept a run."""
+"""The accepted forms of RUN in commands."""
 
 
 def is_run(folder: Path) -> bool:
@@ -78,7 +78,7 @@ def full_name(folder: Path) -> str:
 
 
 def shortest_names(folders: Sequence[Path]) -> list[str]:
-    """Return the shortest name of each run folder that is not another's as well."""
+    """Return the shortest unambiguous name of each run folder."""
     number = Counter(folder.name for folder in folders)
     return [folder.name if number[folder.name] == 1 else full_name(folder) for folder in folders]
 
@@ -160,7 +160,7 @@ def read_object(file: Path) -> dict[str, Any]:
 
 
 def read_run_id(path: Path) -> str | None:
-    """Return MLflow's id of the run of a folder, None for one that is not recorded.
+    """Return MLflow's id of a folder's run, None for one that is not recorded.
 
     Raises:
         BadInput: the file that has it cannot be read or holds something else.

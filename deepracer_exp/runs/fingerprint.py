@@ -1,4 +1,4 @@
-"""Fingerprint of a run: the configuration and files it was started with, so that it is resumed with no others."""
+"""Fingerprint of a run: its configuration and files, so that no others are used to resume it."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ HARMLESS = (
     "report",
     "trace",
 )
-"""Keys, or their first parts, that change nothing of what a run learns. `runs_dir` is where the run is found."""
+"""Keys, or their first parts, without influence on learning. `runs_dir` is where the run is found."""
 _MEASURED_BY = "stopping.episodes"
 """Number of episodes behind `lap_share` in every row of metrics.jsonl."""
 REMEMBERED_EPISODES = 50
@@ -38,9 +38,9 @@ def fingerprint(config: Mapping[str, Any], setup: RaceSetup) -> dict[str, Any]:
 def refuse_changes(
     run_dir: Path, before: Mapping[str, Any], config: Mapping[str, Any], setup: RaceSetup
 ) -> None:
-    """Refuse to resume a run with other values or files than it was started with.
+    """Refuse to resume a run with values or files other than its own.
 
-    `before` is its `fingerprint`; `config` and `setup` are what it would be resumed with.
+    `before` is its `fingerprint`; `config` and `setup` are those to resume with.
 
     Raises:
         BadInput: a value or a file that matters differs; all of them are named.

@@ -1,4 +1,4 @@
-"""The folder of a run that is being trained: its lock, its log and what is written into it."""
+"""The folder of a run in training: its lock, its log and its files."""
 
 import contextlib
 import datetime
@@ -85,10 +85,10 @@ class RunFolder:
     def describe(
         self, composition: Composition, reward: RewardSource, seed: int, names: Mapping[str, str]
     ) -> str | None:
-        """Write the configuration and where code and reward come from; return the git commit if there is one.
+        """Write the configuration and the provenance of code and reward; return the git commit if there is one.
 
         config.yaml makes a folder a run, and is written last: a run that was killed at any moment can be resumed.
-        `names` are what a racer calls its choices.
+        `names` are readable names of its choices.
         """
         overrides = "".join(f"- {json.dumps(override)}\n" for override in composition.overrides)
         self.write(OVERRIDES, overrides or "[]\n")
@@ -144,7 +144,7 @@ class RunFolder:
         self.write(METRICS, "".join(json.dumps(row) + "\n" for row in rows))
 
     def rewind(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Go back to the last of these rows of metrics.jsonl: what was written later goes."""
+        """Truncate metrics.jsonl after the last of these rows."""
         self.write_metrics(rows)
         if (self.path / MACHINE_USE).exists():
             steps = {row["env_steps"] for row in rows}
@@ -162,7 +162,7 @@ class RunFolder:
         return atomic_write(self.path / name, text)
 
     def open_log(self) -> None:
-        """Log what the project logs to log.txt as well, until the folder is released."""
+        """Copy the project's log to log.txt until the folder is released."""
         self._log = _LogFile(self.path / LOG, encoding="utf-8")
         self._log.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
         logger.addHandler(self._log)
@@ -235,7 +235,7 @@ def _make_new(parent: Path, name: str) -> Path:
 
 
 class _LogFile(logging.FileHandler):
-    """Is silent about a full disk, which the end of the run reports in one line."""
+    """Ignores a full disk, which the end of the run reports in one line."""
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - the base class's name
         pass

@@ -1,4 +1,4 @@
-"""Lineage: what a run was cloned from, and the family tree of its ancestors and clones."""
+"""Lineage: the parent of a clone, and the family tree of ancestors and clones."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -19,7 +19,7 @@ from .files import LINEAGE, REWARD, RunRecord, is_run, read_head
 from .result import RunResult, read_result
 
 _NO_EFFECT = ("runs_dir", "debug", "report", "tracking")
-"""Groups that change nothing of how the car drives."""
+"""Groups without influence on driving."""
 _IGNORED = ("name", "code")
 _Place = TypeVar("_Place")
 
@@ -48,7 +48,7 @@ _ADAPTER = TypeAdapter(Lineage)
 
 
 def read_lineage(run: Path) -> Lineage | None:
-    """Return what a run was cloned from, None if it was not cloned.
+    """Return the lineage of a clone, None for any other run.
 
     Raises:
         BadInput: the file cannot be read or holds something else.
@@ -57,7 +57,7 @@ def read_lineage(run: Path) -> Lineage | None:
 
 
 def refuse_other_networks(parent: Experiment, clone: Experiment) -> None:
-    """Refuse a clone for which the parent's networks were not made.
+    """Refuse a clone that the parent's networks do not fit.
 
     Raises:
         BadInput: networks, algorithm, sensors, features or actions differ.
@@ -159,7 +159,7 @@ def family(run: Path, runs_dir: Path) -> FamilyMember:
 
 
 def clone_chain(runs: Sequence[Path]) -> list[Path]:
-    """Return those of the runs that are a run and its clones, the oldest first; an unreadable lineage counts as none.
+    """Select a run and its clones among runs, the oldest first; an unreadable lineage counts as none.
 
     The result is of resolved folders.
     """
@@ -175,9 +175,9 @@ def clone_chain(runs: Sequence[Path]) -> list[Path]:
 
 
 def best_members(root: FamilyMember) -> dict[int, str]:
-    """Return the best of the family by `id`, with what it is the best by: of each track and measure.
+    """Return the best of the family on each track and by each measure, by `id`, with these measures.
 
-    Where a run was evaluated, those that were not are out.
+    If any run was evaluated, only evaluated ones count.
     """
     rated = [(relative, relative.result) for relative in root.walk() if relative.result is not None]
     rated = [pair for pair in rated if pair[1].evaluated] or rated

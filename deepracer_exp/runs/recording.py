@@ -1,4 +1,4 @@
-"""The recording of a run of ours: in the schema that all logs share, and what only a run has."""
+"""The recording of a run of ours: the schema that all logs share, and the data that only a run has."""
 
 import contextlib
 import json
@@ -66,7 +66,7 @@ EVALUATION_COLUMNS: Mapping[str, tuple[str, str]] = {
     "completion": ("float64", "per cent of the lap, mean over the trials"),
     "held_out_completion": (
         "float64",
-        "the same on conditions held out of the training; NaN where not evaluated",
+        "the same under held-out conditions; NaN where not evaluated",
     ),
     "lap_share": ("float64", "complete laps as a share of those tried; NaN where not known"),
     "laps": ("float64", "complete laps; NaN where not known"),
@@ -103,7 +103,7 @@ _ACTION_SPACE: TypeAdapter[ActionSpaceConfig] = TypeAdapter(ActionSpaceConfig)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RunRecording:
-    """The recording of a run of ours, with what no log of the service has."""
+    """The recording of a run of ours, with data that no log of the service has."""
 
     recording: Recording
     best: RunResult
@@ -154,9 +154,8 @@ def read_log(path: Path) -> Recording | RunRecording | EvaluationRecording:
 def read_run_recording(folder: Path) -> RunRecording:
     """Read a run of ours.
 
-    The rows are those of the last iterations of its trace, no more than `MOST_STEPS`, by episode and step. What cannot
-    be read of it is left out and listed. `folder` has
-    `trace/`, `metrics.jsonl`, `config.yaml` and `reward_function.py`.
+    The rows are those of the last iterations of its trace, no more than `MOST_STEPS`, by episode and step. Unreadable
+    parts are left out and listed. `folder` has `trace/`, `metrics.jsonl`, `config.yaml` and `reward_function.py`.
 
     Raises:
         BadInput: there is no trace, or nothing of it can be read.
@@ -262,7 +261,7 @@ def _columns(
 
 
 def _too_old(file: pq.ParquetFile, room: int) -> int:
-    """Return how many of the first rows go, so that `room` rows of whole iterations at most are left."""
+    """Return the number of first rows to drop, so that at most `room` rows of whole iterations are left."""
     if file.metadata.num_rows <= room:
         return 0
     iterations = stored_values(stored_column(file, "iteration"))
@@ -336,7 +335,7 @@ def _others(folder: Path, config: Mapping[str, Any], problems: list[LogProblem])
 
 
 def _decision(folder: Path) -> Mapping[str, Any] | None:
-    """Return what the run's stopping rule decided, None if it did not or that cannot be read."""
+    """Return the decision of the run's stopping rule, None if there is none or it cannot be read."""
     try:
         decision = read_object(folder / SUMMARY).get("stopping")
     except BadInput:  # `_best` reports it
@@ -349,7 +348,7 @@ def _decision(folder: Path) -> Mapping[str, Any] | None:
 
 
 def _best(folder: Path, problems: list[LogProblem]) -> RunResult:
-    """Return what the run's summary says of its best checkpoint."""
+    """Return the result of the best checkpoint in the run's summary."""
     try:
         result = read_result(folder)
     except BadInput as error:

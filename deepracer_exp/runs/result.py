@@ -1,4 +1,4 @@
-"""The result of a run by its summary: its end, and the figures of its best checkpoint."""
+"""The result of a run from its summary: its ending, and the figures of its best checkpoint."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -39,7 +39,7 @@ higher value is better (1) or a lower one (-1)."""
 
 
 def of_conditions(name: str, has_held_out: bool) -> str:
-    """Return the name of a measure of both conditions, as it is where there were no laps on the held-out ones."""
+    """Return the name of a measure of both conditions, shortened to the usual ones if no held-out laps were driven."""
     return name if has_held_out else name.replace("(usual and held-out)", "(usual)")
 
 
@@ -55,7 +55,7 @@ class Ending:
     status: str
     """FINISHED, STOPPED_EARLY (more training would not have helped), INTERRUPTED or FAILED."""
     reason: str
-    """A sentence on what ended it."""
+    """A sentence on why it ended."""
     rule: str | None = None
     """Name of the stopping rule or the pruner that ended it; None: something else did."""
     limit: str | None = None
@@ -78,7 +78,7 @@ class Ending:
         return None if status is None else cls(status, reason, summary.get("rule"), summary.get("limit"))
 
     def __str__(self) -> str:
-        """Return it in words: ``finished: budget reached: env_steps``."""
+        """Return the ending in words: ``finished: budget reached: env_steps``."""
         return f"{self.status}: {self.reason}"
 
 
@@ -111,11 +111,11 @@ class RunResult:
 
     @property
     def criterion(self) -> str:
-        """Return what its rank goes by, in words."""
+        """Return the criterion of its rank in words."""
         return of_conditions(CRITERIA.get(self.measure, self.measure), self.held_out_completion is not None)
 
     def words(self) -> str:
-        """Return the figures that are known: ``mean usual lap 7.97 s, usual completion 100.0%``."""
+        """Return the known figures: ``mean usual lap 7.97 s, usual completion 100.0%``."""
         if not self.evaluated:
             figures = [
                 ("exploring completion, %", self.completion, "{:.1f}"),
@@ -138,7 +138,7 @@ class RunResult:
 
 @dataclass(frozen=True, kw_only=True)
 class ReliableLap:
-    """The lap of the evaluated policy that was the fastest of the reliable ones of its run."""
+    """The lap of the fastest reliable policy among a run's evaluated ones."""
 
     iteration: int
     """Iteration after which the policy was evaluated, the number of its checkpoint."""
@@ -150,7 +150,7 @@ class ReliableLap:
     """Laps tried on the usual conditions."""
 
     def __str__(self) -> str:
-        """Return it in words: ``checkpoint 40, 6.72 s, 8 of 8``."""
+        """Return the lap in words: ``checkpoint 40, 6.72 s, 8 of 8``."""
         return f"checkpoint {self.iteration}, {self.lap_time_s:.2f} s, {self.laps} of {self.laps_tried}"
 
 
@@ -172,7 +172,7 @@ def fastest_reliable(rows: Iterable[Mapping[str, Any]]) -> ReliableLap | None:
 
 
 def why_not_fastest(result: RunResult, rows: Iterable[Mapping[str, Any]]) -> str | None:
-    """Return why the best checkpoint is another than that of the fastest reliable lap; None where it is not."""
+    """Return why the best checkpoint is not the one with the fastest reliable lap; None if it is."""
     by_iteration = {row["iteration"]: row for row in rows}
     lap = fastest_reliable(by_iteration.values())
     if lap is None or result.iteration in (None, lap.iteration):

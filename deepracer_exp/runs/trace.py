@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 _ENDING, _OTHERS_ENDING, _OPEN_ENDING = "-iteration.parquet", "-others.parquet", "-open.parquet"
 EVALUATION_OTHERS = "others.parquet"
-"""The others of an evaluation, beside the control steps in its folder; the file says among whom it raced."""
+"""File of the boxes, bots and rival of an evaluation, beside the control steps in its folder."""
 _ACCEPTED = "a complete Parquet file of a run"
 _RACE: TypeAdapter[RaceConfig] = TypeAdapter(RaceConfig)
 DECIMALS = {
@@ -94,10 +94,10 @@ class TraceWriter:
             self.flush()
 
     def resume(self, iteration: int) -> None:
-        """Resume after an iteration: there is nothing to take up, every step was written."""
+        """Resume after an iteration: nothing to restore, every step was written."""
 
     def flush(self) -> None:
-        """Write what was added since the file before.
+        """Write the rows added since the last file.
 
         Raises:
             RunFailed: a file cannot be written.
@@ -141,7 +141,7 @@ class LapWriter(TraceWriter):
         self._open: list[pa.Table] = []
 
     def resume(self, iteration: int) -> None:
-        """Take up the episodes that were under way after an iteration."""
+        """Restore the episodes that were under way after an iteration."""
         self._iteration = iteration
         path = self.folder / f"{iteration:05d}{_OPEN_ENDING}"
         if path.is_file():
@@ -161,7 +161,7 @@ class LapWriter(TraceWriter):
             self._steps.pop()  # a run without a lap has no trace
 
     def flush(self) -> None:
-        """Write the laps since the file before, and what is under way; raises as `TraceWriter.flush`."""
+        """Write the laps since the last file, and the episodes under way; raises as `TraceWriter.flush`."""
         super().flush()
         if self._open:
             self._write(_OPEN_ENDING, self._open[0].combine_chunks(), store_decimal_as_integer=True)
@@ -171,7 +171,7 @@ class LapWriter(TraceWriter):
 
 
 def trace_writer(folder: Path, kept: str) -> TraceWriter | None:
-    """Return what writes the steps that are kept: `full`, `laps`, or `off`: None."""
+    """Return the writer for `full` or `laps`, None for `off`."""
     return {"full": TraceWriter, "laps": LapWriter}[kept](folder) if kept != "off" else None
 
 
@@ -208,7 +208,7 @@ def missing_trace(run: Path) -> str:
 
 
 def read_others(folder: Path, least_iteration: int = 0) -> pa.Table | None:
-    """Read where the others of a trace were, `env.placement.SCHEMA`; None where the car was alone.
+    """Read the boxes, bots and rivals of a trace, `env.placement.SCHEMA`; None where the car was alone.
 
     Raises:
         BadInput: a file is incomplete or of another kind.
@@ -234,7 +234,7 @@ def write_evaluation_others(folder: Path, table: pa.Table, race: RaceConfig, per
 
 
 def read_evaluation_others(folder: Path) -> PlacedOthers | None:
-    """Read the others of an evaluation; None where the car was alone.
+    """Read the boxes, bots and rival of an evaluation; None where the car was alone.
 
     Raises:
         BadInput: the file is incomplete or of another kind.
@@ -266,7 +266,7 @@ def _read_others(path: Path) -> pa.Table:
 
 
 def rewind_trace(folder: Path, iteration: int) -> None:
-    """Remove what was written after an iteration, and files that were not completed."""
+    """Remove files written after an iteration, and incomplete ones."""
     for file in folder.glob("*"):
         number = file.name.partition("-")[0]
         if not number.isdigit() or int(number) > iteration:

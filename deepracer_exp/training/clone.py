@@ -47,8 +47,8 @@ _ALLOWED = {
 def plan_clone(parent: StoredRun, changes: Sequence[str], *, stored: bool = False) -> TrainPlan:
     """Change the configuration of a run and read its files.
 
-    `parent` has the checkpoint to begin with. `stored`: whether a study holds the overrides; the user's own words
-    otherwise.
+    `parent` has the checkpoint to begin with. `stored`: whether the overrides come from a stored study, not from the
+    user.
 
     Raises:
         BadInput: what the overrides ask for is not accepted or does not fit the parent's networks, or the reward

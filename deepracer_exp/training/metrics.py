@@ -21,8 +21,7 @@ _FEWEST_EPISODES = 10  # with fewer, the mean completion says little about the p
 
 
 def track_names(setup: RaceSetup) -> list[str]:
-    """Return the names of the courses: of a single one its own, which a file may set; of several those of the
-    options."""
+    """Return the names of courses: of a single one its own, which a file may set; of several those of the options."""
     courses = setup.courses
     return [course.name for course in courses] if len(courses) > 1 else [setup.track.name]
 
