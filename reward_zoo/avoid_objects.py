@@ -1,9 +1,9 @@
-"""Teaches fast laps among boxes and bots: metres made, less a cost of each step, of danger, and of a crash.
+"""Teaches fast laps among boxes and bots: rewards progress, less a cost of each step, of danger, and of a crash.
 
-As progress_delta it adds up to what a lap is worth, so that a detour costs what it takes. On top, each step costs in
-which the next object is near and the car is not clear of it across the road, the more the nearer. Distances of objects
-count from the start line, so the gap is their difference to the car's own, around the lap. Fails where both lanes are
-blocked at the same place, and as progress_delta does.
+The sum over a lap is that of progress_delta, so that a detour costs only its time. On top, each step near the next
+object costs, the more the nearer, while the car is not clear of it across the road. Distances of objects count from the
+start line, so the gap is their difference to the car's own, around the lap. Fails where both lanes are blocked at the
+same place, and as progress_delta does.
 """
 
 import numpy as np

@@ -1,20 +1,20 @@
 """Teaches a compromise: near the centre line and fast, each with a weight of its own.
 
-A step on from following the centre line once that works; raise SPEED_WEIGHT from one training to the next.
-Fails when one weight drowns the other: too much speed runs wide, too little crawls. The sum may also pay for
-speed at the very border; `prevent_zig_zag` or `racing_line` are stricter.
+A step on from following the centre line once that works; raise SPEED_WEIGHT from one training to the next. Fails when
+one weight drowns the other: too much speed runs wide, too little crawls. The sum may also reward speed at the very
+border; `prevent_zig_zag` or `racing_line` are stricter.
 """
 
 import numpy as np
 
 CENTER_WEIGHT = 1.0
 SPEED_WEIGHT = 1.0
-TOP_SPEED_MPS = 4.0  # pays SPEED_WEIGHT
-FLOOR = 0.001  # pay with a wheel off the road
+TOP_SPEED_MPS = 4.0  # its reward is SPEED_WEIGHT
+FLOOR = 0.001  # reward with a wheel off the road
 
 
 def terms(params: dict) -> dict:
-    """Return what each part pays; a log analysis shows them one by one."""
+    """Return the parts of the reward; a log analysis shows them one by one."""
     share = min(1.0, params["distance_from_center"] / (0.5 * params["track_width"]))
     on_road = params["all_wheels_on_track"]
     return {
@@ -25,7 +25,7 @@ def terms(params: dict) -> dict:
 
 
 def reward_function(params: dict) -> float:
-    """Pay for nearness to the centre line and for speed."""
+    """Reward nearness to the centre line and speed."""
     return sum(terms(params).values())
 
 
@@ -33,5 +33,5 @@ def reward_batch(params: dict) -> np.ndarray:
     """Apply the same formula to many cars."""
     share = np.minimum(1.0, params["distance_from_center"] / (0.5 * params["track_width"]))
     speed = params["speed"] / TOP_SPEED_MPS
-    pay = FLOOR + CENTER_WEIGHT * (1.0 - share * share) + SPEED_WEIGHT * speed
-    return np.where(params["all_wheels_on_track"], pay, FLOOR)
+    reward = FLOOR + CENTER_WEIGHT * (1.0 - share * share) + SPEED_WEIGHT * speed
+    return np.where(params["all_wheels_on_track"], reward, FLOOR)

@@ -1,4 +1,4 @@
-"""Teaches the car to point along the road: pays for the angle between its heading and the centre line.
+"""Teaches the car to point along the road: rewards a small angle between its heading and the centre line.
 
 Gives a hint in every position, also far from the centre, so it joins well with other terms. Fails alone: a
 car that drives parallel to the road may leave it in full agreement with this reward, and in tight corners
@@ -9,8 +9,8 @@ import math
 
 import numpy as np
 
-SHARPNESS = 2.0  # larger: only small angles still pay
-OFF_ROAD_FACTOR = 0.1  # share of the pay that is left with a wheel off the road
+SHARPNESS = 2.0  # larger: only small angles are rewarded
+OFF_ROAD_FACTOR = 0.1  # share of the reward that is left with a wheel off the road
 FLOOR = 0.001
 
 
@@ -26,7 +26,7 @@ def _direction(params: dict) -> tuple:
 
 
 def reward_function(params: dict) -> float:
-    """Pay for heading along the centre line."""
+    """Reward heading along the centre line."""
     dx, dy = _direction(params)
     heading = math.radians(params["heading"])
     along = max(0.0, dx * math.cos(heading) + dy * math.sin(heading)) ** SHARPNESS

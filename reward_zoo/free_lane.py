@@ -1,4 +1,4 @@
-"""Teaches to drive in the free lane: metres made, less a cost of each step behind a near object in the own lane.
+"""Teaches to drive in the free lane: rewards progress, less a cost of each step behind a near object in its lane.
 
 A lane is one side of the centre line. As progress_delta it adds up to what a lap is worth; on top, each step costs in
 which the next object is near and on the same side of the centre line as the car, the more the nearer. So the car

@@ -12,13 +12,13 @@ import numpy as np
 
 LOOK_AHEAD_M = 1.0
 WHEELBASE_M = 0.164
-TOLERANCE_DEG = 20.0  # an error of this size pays nothing
-SPEED_WEIGHT = 0.25  # extra pay for 1 m/s while steering right
-FLOOR = 0.001  # pay with a wheel off the road
+TOLERANCE_DEG = 20.0  # no reward from this error on
+SPEED_WEIGHT = 0.25  # extra reward for 1 m/s while steering right
+FLOOR = 0.001  # reward with a wheel off the road
 
 
 def reward_function(params: dict) -> float:
-    """Pay for steering onto the arc through the point ahead."""
+    """Reward steering onto the arc through the point ahead."""
     if not params["all_wheels_on_track"]:
         return FLOOR
     points = params["waypoints"]
@@ -55,5 +55,5 @@ def reward_batch(params: dict) -> np.ndarray:
     wanted = np.degrees(np.arctan2(2.0 * WHEELBASE_M * np.sin(angle), distance))
     wanted = np.where(np.cos(angle) < 0.0, np.copysign(90.0, wanted), wanted)
     right = np.maximum(0.0, 1.0 - np.abs(params["steering_angle"] - wanted) / TOLERANCE_DEG)
-    pay = FLOOR + right * (1.0 + SPEED_WEIGHT * params["speed"])
-    return np.where(params["all_wheels_on_track"], pay, FLOOR)
+    reward = FLOOR + right * (1.0 + SPEED_WEIGHT * params["speed"])
+    return np.where(params["all_wheels_on_track"], reward, FLOOR)

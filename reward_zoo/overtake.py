@@ -1,9 +1,9 @@
-"""Teaches to pass other cars: metres made, and on top the metres gained on the nearest other while it is close.
+"""Teaches to pass other cars: rewards progress, and on top the metres gained on the nearest car while it is close.
 
-As progress_delta it adds up to what a lap is worth. On top, each step counts in which an other is within a reach, ahead
-or behind: what the car has made less what the other has. So a pass is worth twice the reach times the weight, being
-passed costs the same, and following brings nothing. Fails where the weight is so large that catching up by cutting
-corners off the road pays, where `objects_speed` is wrong as the service has it, and as progress_delta does.
+The sum over a lap is that of progress_delta. On top, each step within reach of another car, ahead or behind, adds the
+progress of this car less that of the other. So a pass returns twice the reach times the weight, being passed costs the
+same, and following returns nothing. Fails where the weight is so large that cutting corners off the road to catch up
+returns more, where `objects_speed` is wrong as the service has it, and as progress_delta does.
 """
 
 import numpy as np
@@ -52,7 +52,7 @@ def terms(params: dict) -> dict:
 
 
 def reward_function(params: dict) -> float:
-    """Reward progress since the last call and what was gained on the nearest other, less the costs."""
+    """Reward progress since the last call and the gain on the nearest other, less the costs."""
     parts = terms(params)
     return parts["progress"] + (parts["time"] + parts["off_road"] + parts["crash"] + parts["gain"])
 

@@ -7,13 +7,13 @@ angle is set too small: turning in costs more than leaving the line does, and th
 import numpy as np
 
 FREE_STEERING_DEG = 15.0  # steering up to this angle costs nothing
-FULL_STEERING_DEG = 30.0  # steering at this angle costs STEERING_COST of the pay
+FULL_STEERING_DEG = 30.0  # steering at this angle costs STEERING_COST of the reward
 STEERING_COST = 0.5
 FLOOR = 0.001
 
 
 def reward_function(params: dict) -> float:
-    """Pay for nearness to the centre line, less a share for hard steering."""
+    """Reward nearness to the centre line, less a share for hard steering."""
     share = params["distance_from_center"] / (0.5 * params["track_width"])
     excess = (abs(params["steering_angle"]) - FREE_STEERING_DEG) / (FULL_STEERING_DEG - FREE_STEERING_DEG)
     calm = 1.0 - STEERING_COST * min(1.0, max(0.0, excess))

@@ -1,8 +1,8 @@
-"""Teaches fast laps by exact account: rewards the metres made since the last call, less a cost of each step.
+"""Teaches fast laps: rewards the progress in metres since the last call, less a cost of each step.
 
-The sum over a lap is its length less the steps it took: of two laps the faster one returns more, by the same amount for
-each second on any track, and no detour is worth anything. It remembers the last call in a module global, as many race
-winners do; for many cars at once the progress before the step comes with the params. Fails where progress itself
+The sum over a lap is its length less the cost of its steps: of two laps the faster one returns more, by the same amount
+for each second on any track, and no detour returns anything. It remembers the last call in a module global, as many
+race winners do; for many cars at once the progress before the step comes with the params. Fails where progress itself
 misleads: beside a road that runs close by, and on the service where a training is stopped in the middle of an episode.
 """
 

@@ -1,11 +1,10 @@
 """Teaches a racing line with target speeds, both worked out from the waypoints on the first call.
 
-The line is the one of least curvature that stays within LINE_ROOM_M of the centre line; its target speeds
-follow from the grip in corners and the braking before them. Pays for being on the line, pointing along it and
-driving the target speed. Fails when the constants do not fit car or road: more room than the road has leads
-over the border, more grip than the tyres have leads off the line. Sharp rewards are slow to learn from
-scratch; follow the centre line first. The validator of deepracer-on-aws refuses it, because SciPy and NumPy
-import modules of their own while it is called.
+The line is the one of least curvature that stays within LINE_ROOM_M of the centre line; its target speeds follow from
+the grip in corners and the braking before them. Rewards being on the line, pointing along it and driving the target
+speed. Fails when the constants do not fit car or road: more room than the road has leads over the border, more grip
+than the tyres have leads off the line. Sharp rewards are slow to learn from scratch; follow the centre line first. The
+validator of deepracer-on-aws refuses it, because SciPy and NumPy import modules of their own while it is called.
 """
 
 import math
@@ -14,15 +13,15 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 LINE_ROOM_M = 0.3  # how far from the centre line the racing line may go; less than half the road
-LINE_WIDTH_M = 0.25  # distance from the line at which its pay has fallen to a third
+LINE_WIDTH_M = 0.25  # distance from the line at which its reward has fallen to a third
 LINE_WEIGHT = 1.0
-SPEED_WEIGHT = 2.0  # pay for driving the target speed where that is TOP_SPEED_MPS; less where slower
-SPEED_WIDTH_MPS = 1.0  # speed error at which that pay has fallen to a third
+SPEED_WEIGHT = 2.0  # reward for driving the target speed where that is TOP_SPEED_MPS; less where slower
+SPEED_WIDTH_MPS = 1.0  # speed error at which that reward has fallen to a third
 LATERAL_MPS2 = 4.0  # grip in corners
 BRAKING_MPS2 = 3.0
 TOP_SPEED_MPS = 4.0
 SAMPLES = 120  # points of the line
-FLOOR = 0.001  # pay with a wheel off the road
+FLOOR = 0.001  # reward with a wheel off the road
 
 _lines: dict = {}
 
@@ -73,7 +72,7 @@ def _racing_line(params: dict) -> tuple:
 
 
 def terms(params: dict) -> dict:
-    """Return what each part pays; a log analysis shows them one by one."""
+    """Return the parts of the reward; a log analysis shows them one by one."""
     if not params["all_wheels_on_track"]:
         return {"floor": FLOOR, "line": 0.0, "speed": 0.0}
     x, y, direction, target = _racing_line(params)
@@ -88,7 +87,7 @@ def terms(params: dict) -> dict:
 
 
 def reward_function(params: dict) -> float:
-    """Pay for line, direction and target speed."""
+    """Reward line, direction and target speed."""
     return sum(terms(params).values())
 
 
@@ -101,5 +100,5 @@ def reward_batch(params: dict) -> np.ndarray:
     along = np.maximum(0.0, direction[i, 0] * np.cos(heading) + direction[i, 1] * np.sin(heading))
     on_line = np.exp(-squared[np.arange(len(i)), i] / LINE_WIDTH_M**2)
     fit = np.exp(-(((params["speed"] - target[i]) / SPEED_WIDTH_MPS) ** 2)) * target[i] / TOP_SPEED_MPS
-    pay = FLOOR + along * (LINE_WEIGHT * on_line + SPEED_WEIGHT * fit)
-    return np.where(params["all_wheels_on_track"], pay, FLOOR)
+    reward = FLOOR + along * (LINE_WEIGHT * on_line + SPEED_WEIGHT * fit)
+    return np.where(params["all_wheels_on_track"], reward, FLOOR)

@@ -1,9 +1,8 @@
 """Teaches the car to brake before a corner and to speed up on leaving it.
 
-Measures by how much the road turns within the look-ahead, derives a target speed and pays for matching it.
-Good for a car that gets round but takes all corners at one speed. Fails when the look-ahead is shorter than
-the braking distance, or when SHARP_TURN_DEG asks for caution in every bend. At the end of a road that is no
-loop it looks back to the start.
+Measures by how much the road turns within the look-ahead, derives a target speed and rewards matching it. Good for a
+car that gets round but takes all corners at one speed. Fails when the look-ahead is shorter than the braking distance,
+or when SHARP_TURN_DEG asks for caution in every bend. At the end of a road that is no loop it looks back to the start.
 """
 
 import math
@@ -14,12 +13,12 @@ LOOK_AHEAD_M = 1.5
 SHARP_TURN_DEG = 60.0  # a turn of this size within the look-ahead asks for the lowest speed
 LOW_SPEED_MPS = 1.2
 TOP_SPEED_MPS = 4.0
-SPEED_WEIGHT = 0.3  # extra pay for 1 m/s while the speed is right
-FLOOR = 0.001  # pay with a wheel off the road
+SPEED_WEIGHT = 0.3  # extra reward for 1 m/s while the speed is right
+FLOOR = 0.001  # reward with a wheel off the road
 
 
 def reward_function(params: dict) -> float:
-    """Pay for the speed that fits the bend ahead."""
+    """Reward the speed that fits the bend ahead."""
     if not params["all_wheels_on_track"]:
         return FLOOR
     points = params["waypoints"]
@@ -62,5 +61,5 @@ def reward_batch(params: dict) -> np.ndarray:
     turn = np.abs(np.degrees(np.arctan2(ax * by - ay * bx, ax * bx + ay * by)))
     target = TOP_SPEED_MPS - (TOP_SPEED_MPS - LOW_SPEED_MPS) * np.minimum(1.0, turn / SHARP_TURN_DEG)
     right = np.maximum(0.0, 1.0 - np.abs(params["speed"] - target) / (TOP_SPEED_MPS - LOW_SPEED_MPS))
-    pay = FLOOR + right * (1.0 + SPEED_WEIGHT * params["speed"])
-    return np.where(params["all_wheels_on_track"], pay, FLOOR)
+    reward = FLOOR + right * (1.0 + SPEED_WEIGHT * params["speed"])
+    return np.where(params["all_wheels_on_track"], reward, FLOOR)

@@ -7,13 +7,13 @@ action asks for, not what the car does.
 
 import numpy as np
 
-TOP_SPEED_MPS = 4.0  # pays 1
-SHARPNESS = 2.0  # larger: only high speeds pay
-FLOOR = 0.001  # pay at standstill and with a wheel off the road
+TOP_SPEED_MPS = 4.0  # reward 1
+SHARPNESS = 2.0  # larger: only high speeds are rewarded
+FLOOR = 0.001  # reward at standstill and with a wheel off the road
 
 
 def reward_function(params: dict) -> float:
-    """Pay for commanded speed on the road."""
+    """Reward commanded speed on the road."""
     if not params["all_wheels_on_track"]:
         return FLOOR
     return FLOOR + (params["speed"] / TOP_SPEED_MPS) ** SHARPNESS
@@ -21,5 +21,5 @@ def reward_function(params: dict) -> float:
 
 def reward_batch(params: dict) -> np.ndarray:
     """Apply the same formula to many cars."""
-    pay = FLOOR + (params["speed"] / TOP_SPEED_MPS) ** SHARPNESS
-    return np.where(params["all_wheels_on_track"], pay, FLOOR)
+    reward = FLOOR + (params["speed"] / TOP_SPEED_MPS) ** SHARPNESS
+    return np.where(params["all_wheels_on_track"], reward, FLOOR)

@@ -1,20 +1,20 @@
-"""Teaches the car to finish within a number of steps: pays for being ahead of an even schedule for the lap.
+"""Teaches the car to finish within a number of steps: rewards being ahead of an even schedule for the lap.
 
-Sets a goal in the unit in which lap times are counted, and pays a bonus at the finish that grows the sooner
-it comes. Fails when TARGET_STEPS is far from what the car can do: always late pays the floor, always early
-pays for anything. Set it per track, a little below the best lap so far.
+Sets a goal in the unit of lap times, with a bonus at the finish that grows the earlier it comes. Fails when
+TARGET_STEPS is far from what the car can do: always late returns the floor, always early rewards anything. Set it per
+track, a little below the best lap so far.
 """
 
 import numpy as np
 
 TARGET_STEPS = 300.0  # steps of a lap on schedule (15 a second)
-SCHEDULE_WEIGHT = 5.0  # extra pay for being a whole lap ahead
-FINISH_BONUS = 20.0  # pay for a finish on schedule
+SCHEDULE_WEIGHT = 5.0  # extra reward for being a whole lap ahead
+FINISH_BONUS = 20.0  # reward for a finish on schedule
 FLOOR = 0.001
 
 
 def terms(params: dict) -> dict:
-    """Return what each part pays; a log analysis shows them one by one."""
+    """Return the parts of the reward; a log analysis shows them one by one."""
     steps = max(1.0, params["steps"])
     ahead = params["progress"] / 100.0 - steps / TARGET_STEPS
     finished = params["progress"] >= 100.0
@@ -25,7 +25,7 @@ def terms(params: dict) -> dict:
 
 
 def reward_function(params: dict) -> float:
-    """Pay for being ahead of schedule, and for the finish."""
+    """Reward being ahead of schedule, and the finish."""
     return sum(terms(params).values())
 
 
@@ -33,5 +33,5 @@ def reward_batch(params: dict) -> np.ndarray:
     """Apply the same formula to many cars."""
     steps = np.maximum(1.0, params["steps"])
     ahead = params["progress"] / 100.0 - steps / TARGET_STEPS
-    pay = np.where(params["all_wheels_on_track"], np.maximum(FLOOR, 1.0 + SCHEDULE_WEIGHT * ahead), FLOOR)
-    return pay + np.where(params["progress"] >= 100.0, FINISH_BONUS * TARGET_STEPS / steps, 0.0)
+    reward = np.where(params["all_wheels_on_track"], np.maximum(FLOOR, 1.0 + SCHEDULE_WEIGHT * ahead), FLOOR)
+    return reward + np.where(params["progress"] >= 100.0, FINISH_BONUS * TARGET_STEPS / steps, 0.0)

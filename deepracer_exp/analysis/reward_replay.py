@@ -1,4 +1,4 @@
-"""Another reward function on the same driving: what it pays for laps and places, in sentences, a table and figures."""
+"""Rewards of another function for the same driving, by lap and place: in sentences, a table and figures."""
 
 import math
 from dataclasses import dataclass
@@ -83,12 +83,12 @@ class ReplayedRewards:
 
     @property
     def best_laps(self) -> Table:
-        """The laps that it pays best."""
+        """The laps with the highest new reward."""
         return table_of(self.laps.head(MOST_LAPS), _LAP_COLUMNS, max(0, len(self.laps) - MOST_LAPS))
 
     @property
     def sentences(self) -> list[str]:
-        """Return in sentences how it would rank the laps and the places."""
+        """Return in sentences how the function would rank laps and places."""
         laps, places, name = self.laps, self.places, self.reward
         lines = [f"There is no complete lap that {name} could rank."]
         if len(laps):
@@ -96,9 +96,10 @@ class ReplayedRewards:
             best, fastest = laps.iloc[0], laps.loc[laps["time_s"].idxmin()]
             ranks = f"{_ordinal(best['time_rank'])} by time, {_ordinal(best['rank'])} by the recorded reward"
             lines = [
-                f"Of {count(len(laps), 'complete lap')}{evaluated} {name} would have paid most for the one of episode "
-                f"{best['episode']} ({best['time_s']:.2f} s, {ranks}); the fastest lap ({fastest['time_s']:.2f} s) is "
-                f"{_ordinal(fastest['new_rank'])} instead of {_ordinal(fastest['rank'])}."
+                f"Of {count(len(laps), 'complete lap')}{evaluated} {name} would have rewarded the one of episode "
+                f"{best['episode']} most ({best['time_s']:.2f} s, {ranks}); the fastest lap "
+                f"({fastest['time_s']:.2f} s) is {_ordinal(fastest['new_rank'])} instead of "
+                f"{_ordinal(fastest['rank'])}."
             ]
         if self.correlations:
             texts = {
@@ -142,7 +143,7 @@ class ReplayedRewards:
             name="replayed_laps",
             title="The rewards of fast laps",
             caption="Each point is a complete lap, with its lap time and the sum of its rewards. A reward that asks "
-            "for speed falls from the left to the right; where slow laps are paid like fast ones, the car has no "
+            "for speed falls from the left to the right; where slow laps return as much as fast ones, the car has no "
             "reason to be faster.",
             rows=[panels],
         )
@@ -166,10 +167,10 @@ class ReplayedRewards:
             rows.append([map_panel(course, [spots])])
         return Chart(
             name="replayed_places",
-            title="Where the new reward pays more, and where less",
-            caption="Mean reward of a step at each waypoint, between the least and the most that each reward function "
-            "pays anywhere (2nd and 98th percentile). The curves differ at places that the new reward considers more "
-            "or less important than the recorded one does.",
+            title="Where the new reward is higher, and where lower",
+            caption="Mean reward of a step at each waypoint, between the lowest and the highest of each function "
+            "(2nd and 98th percentile of the waypoints). The curves differ at places that the new reward considers "
+            "more or less important than the recorded one does.",
             rows=rows,
         )
 
@@ -210,10 +211,10 @@ def replay_reward(
     for run_number in np.unique(process[params.paid]):
         function = RewardFunction(source, 1, time_limit_s, None)
         replayed = np.flatnonzero(params.paid & (process == run_number))
-        pay = _at_once if function.is_batch else _one_by_one
+        rewards = _at_once if function.is_batch else _one_by_one
         for begin in range(0, len(replayed), _AT_ONCE):
             some = replayed[begin : begin + _AT_ONCE]
-            new_reward[some] = pay(function, params, steps, some)
+            new_reward[some] = rewards(function, params, steps, some)
     steps["new_reward"] = new_reward
     return ReplayedRewards(
         reward=source.name,
@@ -238,13 +239,13 @@ def _at_once(
 def _one_by_one(
     function: RewardFunction, params: RecordedParams, steps: pd.DataFrame, some: Ids
 ) -> NDArray[np.float64]:
-    paid = np.empty(len(some))
+    rewards = np.empty(len(some))
     for index, answer in enumerate(function.answers(params.dicts(some))):
         if isinstance(answer, Failure):
             place = _place(steps, some[index])
             raise BadInput(function.source.path, f"reward_function {answer.what} ({place})") from answer.error
-        paid[index] = answer
-    return paid
+        rewards[index] = answer
+    return rewards
 
 
 def _place(steps: pd.DataFrame, row: int) -> str:
@@ -277,8 +278,8 @@ def _lap_times(view: LogView) -> pd.DataFrame:
     return both.astype({"stream": str})
 
 
-def _waypoints(paid: pd.DataFrame) -> pd.DataFrame:
-    means = paid.groupby(["reversed", "closest_waypoint"], as_index=False).agg(
+def _waypoints(rewarded: pd.DataFrame) -> pd.DataFrame:
+    means = rewarded.groupby(["reversed", "closest_waypoint"], as_index=False).agg(
         visits=("reward", "size"), reward=("reward", "mean"), new_reward=("new_reward", "mean")
     )
     for name, of in (("share", "reward"), ("new_share", "new_reward")):

@@ -26,7 +26,7 @@ _EPILOG = """\
   deepracer-exp analyze RUN                                 one of our runs
   deepracer-exp analyze ~/Downloads/training.tar.gz         logs of the service, the console or deepracer-for-cloud:
                                                             a folder, an archive or a file of any layout
-  deepracer-exp analyze RUN --reward racing_line            what another reward function would have paid for
+  deepracer-exp analyze RUN --reward racing_line            the rewards of another function for the same driving
   deepracer-exp analyze RUN --target 9.5 --open             the chance of a lap under 9.5 s; open the page
   deepracer-exp analyze RUN --replay laps.html              its fastest exploring lap beside an ordinary one
   deepracer-exp analyze RUN --line line.py                  the line of its fastest exploring lap, for a reward function

@@ -20,10 +20,10 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         commands,
         "validate",
         _validate,
-        help="find out what a reward function pays for",
+        help="find out what a reward function rewards",
         description=(
-            "Check a reward function as deepracer-on-aws does, call it in many situations on the track, draw what it "
-            "pays for, and warn of common mistakes."
+            "Check a reward function as deepracer-on-aws does, call it in many situations on the track, draw its "
+            "rewards, and warn of common mistakes."
         ),
         epilog=_VALIDATE_EPILOG,
     )

@@ -35,7 +35,7 @@ def constant_reward(rewards: np.ndarray) -> Iterator[str]:
 
 
 def pays_off_the_road(of: RewardGrid) -> Iterator[str]:
-    """Warn if driving beside the track pays as much as driving on it, at medium speed."""
+    """Warn if driving beside the track returns as much as driving on it, at medium speed."""
     reward, off = of.reward[1, :, of.along], of.off_track[1, :, of.along]
     on_road, off_road = _best_by_offset(reward, ~off), _best_by_offset(reward, off)
     if on_road is None or off_road is None:
@@ -46,7 +46,7 @@ def pays_off_the_road(of: RewardGrid) -> Iterator[str]:
         than = "more off the track than" if beyond > on + margin else "as much off the track as"
         side = "left" if of.offsets_m[place] > 0 else "right"
         where = f"{abs(of.offsets_m[place]):.2f} m {side} of the centre line"
-        yield f"pays {than} on it: {beyond:.3g} per step {where}, at best {on:.3g} on the track"
+        yield f"returns {than} on it: {beyond:.3g} per step {where}, at best {on:.3g} on the track"
 
 
 def _best_by_offset(reward: np.ndarray, counts: np.ndarray) -> tuple[float, int] | None:
@@ -74,7 +74,7 @@ def pays_for_standing(setup: RaceSetup, laps: list[DrivenLap]) -> Iterator[str]:
         standing.append(probe.rewards(_held(lap, i, setup.car.control_period_s)))
     still, moving = float(np.mean(standing)), float(np.mean(driving))
     if still >= moving - _MARGIN * max(abs(still), abs(moving)):
-        yield f"pays for standing still: {still:.3g} per step, {moving:.3g} for driving"
+        yield f"rewards standing still: {still:.3g} per step, {moving:.3g} for driving"
 
 
 def _held(lap: Situations, row: int, step_s: float) -> Situations:

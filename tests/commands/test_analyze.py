@@ -97,7 +97,7 @@ def test_another_reward_function_is_replayed_and_the_page_opened(run_dir, call, 
     ended = call("analyze", str(run_dir), "--reward", "mine.py", "--open", "--output", "page.html")
     assert ended.code == 0, ended.stderr
     assert "mine" in ended.stdout
-    assert "Paid by another reward function" in findings_told(tmp_path / "page.html")
+    assert "Under another reward function" in findings_told(tmp_path / "page.html")
     assert opened == [(tmp_path / "page.html").resolve().as_uri()]
 
 

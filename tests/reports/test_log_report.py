@@ -87,7 +87,7 @@ def test_the_first_screen_is_what_was_raced_and_exploration_comes_below(html, vi
     result = result_in_words(view)
     times_s = view.evaluation_episodes["lap_time_s"]
     assert result == f"Laps in {times_s.mean():.2f} s, 3 of 3 in its evaluations and races."
-    assert read.text.rindex(result) < read.text.rindex("What was found") < read.text.rindex(headline(view))
+    assert read.text.rindex(result) < read.text.rindex("Findings") < read.text.rindex(headline(view))
     assert next(name for name in read.ids if name.startswith("figure")) == "figure-evaluated_lap"
     lap = raced_lap(view)
     assert lap.words == f"The fastest evaluated lap: {times_s.min():.2f} s"
@@ -113,8 +113,8 @@ def test_the_page_is_small_loads_nothing_and_has_words_and_tables_without_script
         "The fastest exploring laps",
         "Candidates for submission",
         "Iterations",
-        "What was trained",
-        "What was read",
+        "Setup",
+        "Files",
     )
     heads = ("Lap time, s", "25th percentile, s", "Entropy, nats")
     assert [words for words in (headline(view), *titles, *heads) if words not in read.text] == []
@@ -211,8 +211,8 @@ def test_six_figures_are_open_and_the_others_are_drawn_to_size_when_unfolded(pat
 @pytest.mark.parametrize(
     ("recording", "words"),
     [
-        (made_up_recording([Drive(until=0.2)]), "What was found"),
-        (made_up_recording([Drive(until=0.004)]), "What was found"),
+        (made_up_recording([Drive(until=0.2)]), "Findings"),
+        (made_up_recording([Drive(until=0.004)]), "Findings"),
         (made_up_recording([Drive()]), "1 complete lap"),
         (made_up_recording([Drive(off_at=30), Drive(off_at=31)]), "no complete lap"),
         (made_up_recording([], evaluations={"race": [Drive(), Drive(speed_mps=1.6)]}), "No training;"),
@@ -228,7 +228,7 @@ def test_an_unknown_course_has_a_page_without_maps(tmp_path):
     steps = steps.assign(X=steps["X"] * 7 + 100, track_len=steps["track_len"] * 3)
     steps["track"] = steps["track"].cat.rename_categories({"reinvent_base": "my own"})
     text = Html(write_report(season(3, steps=steps, track="my own"), tmp_path / "page.html").read_text()).text
-    assert "What could not be read" in text
+    assert "Unreadable parts" in text
     assert "my own" in text
 
 
@@ -288,7 +288,7 @@ def test_another_reward_is_reported_with_the_ranks_of_laps_and_places(view):
         reward="mine", course=view.course, steps=view.steps, laps=LAPS, waypoints=WAYPOINTS
     )
     assert replayed.sentences[0] == (
-        "Of 3 complete laps mine would have paid most for the one of episode 0 (10.00 s, 1st by time, 3rd by the "
+        "Of 3 complete laps mine would have rewarded the one of episode 0 most (10.00 s, 1st by time, 3rd by the "
         "recorded reward); the fastest lap (10.00 s) is 1st instead of 3rd."
     )
     assert "mine -1.00, recorded reward 1.00; between both rewards -1.00" in replayed.sentences[1]

@@ -30,9 +30,9 @@ def reward_function(params):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (paying('params["distance_from_center"]'), ["pays more off the track than on it"]),
-        (LEFT_GRASS, ["pays more off the track than on it: 2 per step", "m left of the centre line"]),
-        (SPEED, ["pays as much off the track as on it: 2 per step"]),
+        (paying('params["distance_from_center"]'), ["returns more off the track than on it"]),
+        (LEFT_GRASS, ["returns more off the track than on it: 2 per step", "m left of the centre line"]),
+        (SPEED, ["returns as much off the track as on it: 2 per step"]),
         (CENTER, None),
         (paying("-1.0 * params['is_offtrack']"), None),
     ],
@@ -58,7 +58,7 @@ def test_reward_off_the_track_is_reported(race_with, text, words):
 )
 def test_reward_for_standing_is_reported(race_with, laps, text, warned):
     found = list(pitfalls.pays_for_standing(race_with(text), laps))
-    assert [line.startswith("pays for standing still: ") for line in found] == [True] * warned
+    assert [line.startswith("rewards standing still: ") for line in found] == [True] * warned
 
 
 MORE, AS_MUCH = (

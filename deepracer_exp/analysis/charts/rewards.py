@@ -75,7 +75,7 @@ def reward_map(view: LogView) -> Chart | None:
         charts.append(row(kind[actions.number], titles))
     return Chart(
         name="reward_map",
-        title="What the reward function paid, by place",
+        title="Reward by place",
         caption="Mean reward of a step in each cell, with the same colours on all maps; the lowest row shows the "
         "actions taken most often. A fast line should be the bright one: where complete laps run through dark cells, "
         "the reward asks for something other than the lap.",
@@ -102,7 +102,7 @@ def value_map(view: LogView) -> Chart | None:
         caption="Mean sum of the reward of this step and of all later ones of the episode, discounted by "
         f"{view.discount:g} per step, as measured in the last third of the iterations; the critic learns to predict "
         "it. Dark places lead off the road or are close to the end of the lap, and the spread at a waypoint is what "
-        "good driving is worth there.",
+        "good driving gains there.",
         rows=[
             [map_panel(view.course, [cells])],
             [waypoint_panel(layers, "future reward", n)],
@@ -138,8 +138,8 @@ def reward_by_waypoint(view: LogView) -> Chart | None:
     return Chart(
         name="reward_by_waypoint",
         title="Reward by waypoint",
-        caption="What a step at each waypoint was paid over the whole training, and below it what all later steps "
-        "were paid. A best far above the median marks a place where few drivers find what pays; a dip of both is a "
+        caption="The reward of a step at each waypoint over the whole training, and below it the sum of all later "
+        "rewards. A best far above the median marks a place where few episodes find the reward; a dip of both is a "
         "place that the reward function punishes whatever the car does.",
         rows=in_rows(panels, 1),
         share_x=True,
