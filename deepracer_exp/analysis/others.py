@@ -45,18 +45,17 @@ class OthersOnRoad:
     boxes: int
     """How many of them are boxes."""
     corners: NDArray[np.float64]
-    """Corners of the boxes that stand at the same places in every episode, (boxes, 4, 2); (0, 4, 2) where they do
-    not."""
+    """Corners of boxes whose places are the same in every episode, (boxes, 4, 2); (0, 4, 2) without such boxes."""
     lap_share: Values
-    """Where these stand, as shares of the lap, (boxes,); empty where they do not."""
+    """Positions of these as shares of the lap, (boxes,); empty where they move between episodes."""
     crashes: pd.DataFrame
     """One row for each crash: `row` of the steps and `other`, its index."""
     passes: pd.DataFrame
-    """One row each time that one fell behind a car (`overtaken`) or came past it from behind: `row`, `other`."""
+    """One row per overtake, by the car (`overtaken`) or of the car: `row`, `other`."""
 
     @property
     def drive(self) -> str:
-        """Return what those of the others are that drive: `a bot`, `its rival`, or nothing."""
+        """Name the moving others: `a bot`, `its rival`, or an empty string."""
         if len(self.names) == self.boxes:
             return ""
         return f"its {RIVAL}" if self.names[-1] == RIVAL else "a bot"

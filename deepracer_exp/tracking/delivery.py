@@ -1,4 +1,4 @@
-"""Record in MLflow, from a run folder, what the training could not record itself."""
+"""Complete the records of run folders in MLflow after their training."""
 
 import logging
 from collections.abc import Iterable, Iterator, Mapping
@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 
 
 def deliver(run_dir: Path, uri: str | None, runs_dir: Path) -> int:
-    """Record in MLflow what it lacks of an ended run and mark it as ended; return the number of missing metric points.
+    """Complete an ended run in MLflow and mark it as ended; return the number of metric points that were missing.
 
     `uri` is the store, as in `tracking.uri` with its password; None: the one in `runs_dir`.
 
@@ -42,7 +42,7 @@ def deliver(run_dir: Path, uri: str | None, runs_dir: Path) -> int:
     store = resolve_store(uri, runs_dir)
     if tracked.store != store.shown:
         tracked = replace(tracked, store=store.shown, run_id=None, complete=False)
-    if tracked.status is None:  # killed before it noted its end
+    if tracked.status is None:  # killed before it recorded its end
         tracked = replace(tracked, status=ENDS.get(summary["status"], "KILLED"), end_ms=now_ms())
     write_tracked_run(run_dir, tracked)
     projection = MLflowProjection(store, run_dir)
@@ -69,7 +69,7 @@ def deliver_evaluation(
     """Record the results of evaluating a checkpoint of a recorded run in MLflow; errors are logged.
 
     `uri` and `runs_dir` as of `deliver`, `env_steps` are those of the checkpoint, `metrics` have MLflow's names,
-    and each of the `files` its folder in MLflow.
+    `files` map each file to its folder in MLflow.
     """
     run_id = read_run_id(run_dir)
     if run_id is None or not has_store(uri, runs_dir):
@@ -95,7 +95,7 @@ def deliver_evaluation(
 
 
 def is_delivered(run_dir: Path, uri: str | None, runs_dir: Path) -> bool:
-    """Return whether a store was given everything of an ended run, by the run's folder; MLflow is not imported.
+    """Return whether a store has everything of an ended run, according to its folder; MLflow is not imported.
 
     Raises:
         BadInput: tracking.json is invalid, or `uri` can never work.
@@ -106,7 +106,7 @@ def is_delivered(run_dir: Path, uri: str | None, runs_dir: Path) -> bool:
 
 
 def undelivered(folders: Iterable[Path]) -> dict[Path, str]:
-    """Return the ended runs whose store lacks something of them, each with that store, without password.
+    """Return the ended runs that are incomplete in their store, each with that store, without password.
 
     Runs that were not recorded in MLflow are left out; MLflow is not imported.
 
@@ -126,7 +126,7 @@ def deliver_labels(run_id: str, labels: Labels, uri: str | None, runs_dir: Path)
     """Record a run's name, note and tags in MLflow, without those it had before.
 
     Raises:
-        BadInput: the store, as of `deliver`, does not answer or refuses.
+        BadInput: the store does not answer or refuses.
     """
     with open_client(run_id, uri, runs_dir) as client:
         tags, wanted = client.get_run(run_id).data.tags, label_tags(labels)
@@ -147,10 +147,10 @@ def recorded_labels(run_id: str, uri: str | None, runs_dir: Path) -> Labels:
 
 @contextmanager
 def marked_deleted(run_dir: Path, run_id: str, uri: str | None, runs_dir: Path) -> Iterator[None]:
-    """Mark a run as deleted in the store, as of `deliver`, that recorded it, once the block has removed its folder.
+    """Mark a run as deleted in the store that recorded it, once the block has removed its folder.
 
-    The store is asked before, so that nothing is removed where it does not answer. `mlflow gc` removes the run there
-    for good.
+    The store is asked first, so that nothing is removed where it does not answer; `uri` as for `deliver`. `mlflow gc`
+    removes the run there for good.
 
     Raises:
         BadInput: the run was recorded in another store, or this one does not answer.

@@ -17,7 +17,7 @@ _ENDED = {"FINISHED": "finished", "FAILED": "failed", "KILLED": "killed", "RUNNI
 
 
 def rows_of_store(uri: str, runs_dir: Path) -> list[Row]:
-    """Return a row for each run of a store as of `open_client`, the newest first, without those that group others.
+    """Return a row for each run of an MLflow store, the newest first, without the runs of studies that group others.
 
     Raises:
         BadInput: the store does not answer.

@@ -354,16 +354,16 @@ class _Rows:
 
 
 def _words(texts: pa.Array) -> tuple[NDArray[np.int32], list[str]]:
-    """Return texts of which there are few different ones as numbers in a list of these."""
+    """Dictionary-encode repeated strings: return the index of each, and the distinct strings."""
     encoded = texts.dictionary_encode()
     return encoded.indices.to_numpy(), [_text(word) for word in encoded.dictionary.to_pylist()]
 
 
 def _numbers(texts: pa.Array) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return texts as numbers, NaN for those that are none; and which are none."""
+    """Parse texts as numbers, NaN where that fails; and return where it fails."""
     try:
         return pc.cast(texts, pa.float64()).to_numpy(), np.zeros(len(texts), np.bool_)
-    except pa.ArrowInvalid:  # for one text that is no number, or has blanks around it
+    except pa.ArrowInvalid:  # one text is not a number, or has blanks around it
         numbers = [_number(_text(text)) for text in texts.to_pylist()]
         unreadable = np.array([number is None for number in numbers])
         return np.array(numbers, np.float64), unreadable
