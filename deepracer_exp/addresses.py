@@ -1,6 +1,6 @@
 """Passwords in addresses of servers and databases: removed where text comes in, restored to open a connection.
 
-In between, the program has only addresses without passwords, so that nothing it prints or writes can contain one.
+In between, addresses have no passwords, so that no output can contain one.
 """
 
 import re
@@ -16,7 +16,7 @@ _PARAMETER = re.compile(r"(?<=[?&])(?:password|passwd|pwd|token|secret)=([^&\s'\
 _USER_INFO = re.compile(r"(?<=://)[^/\s]*@")
 
 _whole: dict[str, str] = {}
-"""Addresses as given, by the same address without its password."""
+"""Original addresses, by the same address without its password."""
 _secrets: set[str] = set()
 """Every spelling of the passwords that were removed."""
 
@@ -37,17 +37,17 @@ def without_passwords(value: Value) -> Value:
 
 
 def with_password(address: str) -> str:
-    """Return an address with the password that was given to this process, or to the one that it works for."""
+    """Return an address with the password given to this process or its parent."""
     return _whole.get(address, address)
 
 
 def taken_out() -> dict[str, str]:
-    """Return the addresses that had a password, for `take_over` in a process that works for this one."""
+    """Return the addresses that had a password, for `take_over` in a worker."""
     return dict(_whole)
 
 
 def take_over(addresses: Mapping[str, str]) -> None:
-    """Take over the passwords that another process has removed."""
+    """Adopt the passwords that another process has removed."""
     for address in addresses.values():
         without_passwords(address)
 

@@ -1,4 +1,4 @@
-"""What the commands do, for use from Python: the names that `deepracer_exp` exports."""
+"""The commands as Python functions: the names that `deepracer_exp` exports."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ from deepracer_exp.training.trainer import Callback
 
 @dataclass(frozen=True)
 class ComposedExperiment:
-    """An experiment, validated, and where its values come from."""
+    """A validated experiment, with the origin of its values."""
 
     config: Experiment
     """Values as attributes: `config.algorithm.lr`."""
@@ -100,7 +100,7 @@ def resume(
     Args:
         run: as for `evaluate`.
         overrides: as on the command line, e.g. ``budget.env_steps=5000000``.
-        callbacks: as for `train`; those that it was trained with, to call them again.
+        callbacks: as for `train`; pass those of the first start again.
         console: as for `train`.
         runs_dir: where to look for runs.
 
@@ -129,7 +129,7 @@ def evaluate(run: str | Path, *overrides: str) -> Evaluation:
 def load_policy(
     run: str | Path, checkpoint: str | None = None, runs_dir: str | Path = "runs"
 ) -> TensorDictModuleBase:
-    """Return a stored policy: a TorchRL module that reads what its network sees of a `RaceEnv` and writes `action`.
+    """Return a stored policy: a TorchRL module that reads its keys of a `RaceEnv` and writes `action`.
 
     It samples actions; within `torchrl.envs.utils.set_exploration_type(ExplorationType.DETERMINISTIC)` it takes the
     most likely one, as evaluations do.
@@ -147,7 +147,7 @@ def load_policy(
 
 @dataclass(frozen=True)
 class RunTables:
-    """What a run has recorded."""
+    """The recorded tables of a run."""
 
     path: Path
     config: dict[str, Any]

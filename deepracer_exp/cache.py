@@ -1,4 +1,4 @@
-"""What this account keeps between commands because making it again takes long; whatever is removed is made again."""
+"""The account's cache of slow results between commands; anything removed is made again."""
 
 import contextlib
 import functools
@@ -14,11 +14,11 @@ from pathlib import Path
 _PACKAGE = Path(__file__).parent
 _COMPILERS = ("numba", "llvmlite", "numpy")
 _KEPT = 20
-"""Folders of compiled code, each of 10 MB: of several installations, and of sources that change."""
+"""Number of folders of compiled code, each of 10 MB, for several installations and changing sources."""
 
 
 def cache_home() -> Path | None:
-    """Return the folder of all that is kept; None where this account has no home."""
+    """Return the cache's folder; None where this account has no home."""
     try:
         base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     except RuntimeError:
@@ -30,9 +30,9 @@ def cache_home() -> Path | None:
 def compiled_folder() -> Path | None:
     """Return the folder of compiled code, made where it is missing; None where none can be written.
 
-    Its name is a hash of all that the code is compiled from: the files of this package that have compiled functions,
-    wherever they lie, and the versions of Python and of the libraries that compile. Numba's variable `NUMBA_CACHE_DIR`
-    says where the folder lies, if it is set.
+    Its name is a hash of everything that the code is compiled from: the files of this package that have compiled
+    functions, wherever they lie, and the versions of Python and of the libraries that compile. Numba's variable
+    `NUMBA_CACHE_DIR` says where the folder lies, if it is set.
     """
     base = os.environ.get("NUMBA_CACHE_DIR") or cache_home()
     if base is None:

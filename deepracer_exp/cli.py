@@ -24,10 +24,10 @@ Completion in bash or zsh: eval "$(register-python-argcomplete deepracer-exp)"
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command and exit with its code: 0 done, 2 bad input, 3 the run failed, 130 interrupted.
 
-    A reward function runs within the command's process: one that ends it (`os._exit`) or crashes it ends the command.
+    A reward function runs in the command's process: if it ends or crashes that (`os._exit`), the command ends.
 
     Args:
-        arguments: of the command line, for a program that calls it; None: those of this process.
+        arguments: of the command line, for a calling program; None: those of this process.
     """
     # Read when the library of torch's threads is loaded. By default a thread that has nothing to do keeps its core busy
     # for milliseconds: beside other work an update from pictures takes twice as long, or twenty times.

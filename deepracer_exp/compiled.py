@@ -29,7 +29,7 @@ def cfunc(signature: str, *, cache: bool = False) -> Callable[[Callable[..., Any
 
 
 def _kept(decorate: Callable[..., Any]) -> Callable[[Callable[..., Any]], Any]:
-    """Have code kept in the folder of this package; that of other packages stays where numba keeps it."""
+    """Cache this package's code in its own folder; that of other packages stays where numba keeps it."""
 
     def decorated(function: Callable[..., Any]) -> Any:
         # Numba chooses a function's folder when it is decorated.

@@ -8,16 +8,16 @@ from contextlib import contextmanager
 _LONGEST_LINE = 4000
 """Characters of a message; the longest lists of options have fewer."""
 _LONGEST_READ = 100_000
-"""Characters of a message that are looked at: of megabytes that would take seconds."""
+"""Characters of a message that are processed: megabytes would take seconds."""
 _HEAD, _TAIL = 120, 60
 _LONG_VALUE = re.compile(r"\S{400,}|(?<!\w)('|\")(?:(?!\1).){400,}\1(?!\w)")
-"""A value that a message repeats: one word, or quoted. What would be accepted is neither."""
+"""A value that a message repeats: one word, or quoted. Accepted values are neither."""
 
 NO_MEMORY = "needs more memory than there is"
 
 
 class BadInput(ValueError):  # noqa: N818 - reads as what it is at the raise site
-    """Something the user gave cannot be used; its line is ``what: why; accepted: accepted``.
+    """A value or file of the user cannot be used; its line is ``what: why; accepted: accepted``.
 
     Attributes:
         what: the file, key or value; None where `why` is a sentence that names it.
@@ -28,7 +28,7 @@ class BadInput(ValueError):  # noqa: N818 - reads as what it is at the raise sit
     exit_code = 2
 
     def __init__(self, what: object, why: object = None, accepted: object = "") -> None:
-        """Take the parts of the line, or `what` alone: a sentence that says all of it."""
+        """Take the parts of the line, or `what` alone as the whole sentence."""
         self.what = None if why is None else str(what)
         self.why = str(what if why is None else why)
         self.accepted = str(accepted)
@@ -52,7 +52,7 @@ class RunFailed(RuntimeError):  # noqa: N818 - reads as what it is at the raise 
     exit_code = 3
 
     def __init__(self, reason: object) -> None:
-        """Take the line that says why."""
+        """Take the line with the reason."""
         super().__init__(_one_line(str(reason)))
 
 
@@ -63,7 +63,7 @@ def reading(what: object, accepted: str = "", why: str = "") -> Iterator[None]:
     Args:
         what: the key with its value, or the file.
         accepted: what would be accepted, for the message.
-        why: what the error says of it, ahead of the error itself: ``not JSON``.
+        why: the kind of error, ahead of the error itself: ``not JSON``.
 
     Raises:
         BadInput: one line with `what`, the reason and what would be accepted.
@@ -72,7 +72,7 @@ def reading(what: object, accepted: str = "", why: str = "") -> Iterator[None]:
         yield
     except (BadInput, RunFailed):
         raise
-    except Exception as error:  # a library can raise anything for a bad value or file
+    except Exception as error:  # libraries raise any type of error for a bad value or file
         raise BadInput(what, f"{why}: {_reason(error)}" if why else _reason(error), accepted) from error
 
 

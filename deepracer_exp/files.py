@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 Content = TypeVar("Content")
 
 SETTINGS_BYTES = 2**20
-"""Limit for a hand-written file: YAML, JSON, a reward function. None comes near it; a larger file is something else."""
+"""Limit for a hand-written file: YAML, JSON, a reward function. A larger file is something else."""
 ROUTE_BYTES = 2**21
 """Limit for a route: more than 40,000 rows, a hundred times the longest of the service."""
 RECORD_BYTES = 2**30
@@ -83,7 +83,7 @@ def read_text(path: str | Path, accepted: str, most_bytes: int = SETTINGS_BYTES)
 
 
 def read_json(path: str | Path, accepted: str, raw: bytes | None = None) -> Any:
-    """Return what a JSON file holds.
+    """Return the content of a JSON file.
 
     `raw` is its content where that is known: of a member of an archive, or a part of a log.
 
@@ -99,7 +99,7 @@ def read_json(path: str | Path, accepted: str, raw: bytes | None = None) -> Any:
 def read_yaml(
     path: str | Path, accepted: str, load: Callable[[str], Content] | None = None, raw: bytes | None = None
 ) -> Content | Any:
-    """Return what a YAML file holds, as plain values.
+    """Return the content of a YAML file as plain values.
 
     `load` parses the text, None: into plain values; `raw` is as for `read_json`.
 
@@ -118,7 +118,7 @@ def read_yaml(
 def read_json_as(file: Path, adapter: "TypeAdapter[Content]", writer: str) -> Content | None:
     """Read a JSON file whose keys and types are those of a dataclass; None where there is no file.
 
-    `writer` says in messages who writes such files: ``a clone``.
+    `writer` names the writer of such files in messages: ``a clone``.
 
     Raises:
         BadInput: the file cannot be read or holds something else.
@@ -172,7 +172,7 @@ def _check_size(path: str | Path, size: int, accepted: str, most_bytes: int) -> 
 
 
 def _check_structure(text: str) -> None:
-    """Refuse what would take forever to build: a few lines of aliases can stand for billions of values."""
+    """Refuse files that would take forever to build: a few lines of aliases can stand for billions of values."""
     anchors: dict[str, tuple[int, int]] = {}
     open_nodes: list[list[Any]] = [[None, 0, 0]]  # anchor, values and levels of each that is open
     for event in yaml.parse(text, _LOADER):

@@ -61,7 +61,7 @@ def end_with_owner() -> None:
 
 @contextmanager
 def running(command: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a program, in a session of its own, that ends with the block or with this process, whichever is first.
+    """Run a program, in a session of its own, that ends with the block or with this process, whichever ends first.
 
     All that the program has started in its process group ends with it. `options` are those of `subprocess.Popen`.
 

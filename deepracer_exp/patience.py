@@ -1,6 +1,6 @@
-"""How long to wait for processes: until they hang, however busy the machine is.
+"""Waiting for processes until they hang, however busy the machine is.
 
-A limit by the clock alone ends processes that are well: where a dozen others want the same cores, a start of 25 s takes
+A limit by the clock alone ends healthy processes: where a dozen others compete for the cores, a start of 25 s takes
 minutes. So a process is granted seconds of its CPU while it computes, and seconds of the clock only while it does not.
 """
 
@@ -17,21 +17,21 @@ import psutil
 
 LOOK_EVERY_S = 0.5
 _IDLE_SHARE = 0.01
-"""Share of a core up to which a process does nothing: threads that hang look around now and then."""
+"""Share of a core up to which a process counts as idle: hanging threads wake up now and then."""
 
 
 @dataclass(frozen=True)
 class Use:
-    """What processes have used of the machine, at one moment."""
+    """Use of the machine by processes, at one moment."""
 
     cpu_s: float
-    """CPU time of all of them since they began."""
+    """CPU time of all of them since their start."""
     is_ready: bool
     """Whether one of them computes now, or would if it had a core."""
 
 
 def use_of(*pids: int) -> Use:
-    """Return what these processes and all that they have started use; those that are gone use nothing."""
+    """Return the use by these processes and their descendants; ended ones count nothing."""
     cpu_s, is_ready = 0.0, False
     for process in _with_children(pids):
         with suppress(psutil.NoSuchProcess, psutil.AccessDenied), process.oneshot():
@@ -41,7 +41,7 @@ def use_of(*pids: int) -> Use:
 
 
 def use_of_this() -> Use:
-    """Return what the other threads of this process, and all that it has started, use."""
+    """Return the use by the other threads of this process and by its descendants."""
     use = use_of(*(process.pid for process in psutil.Process().children()))
     ended = os.times()
     own_s = time.process_time() - time.thread_time() + ended.children_user + ended.children_system
@@ -56,7 +56,7 @@ def _with_children(pids: Iterable[int]) -> Iterable[psutil.Process]:
 
 
 class Silence:
-    """Counts for how long something that is waited for has not come.
+    """Counts the time that an awaited answer takes.
 
     Attributes:
         computed_s: seconds of CPU that the processes used meanwhile, at most those of the clock.
@@ -69,7 +69,7 @@ class Silence:
         self.restart()
 
     def restart(self) -> None:
-        """Count again, from the next look: what was waited for has come."""
+        """Restart from the next look: the answer has arrived."""
         self.computed_s = self.idle_s = self.clock_s = 0.0
         self._seen: tuple[Use, float] | None = None
 
@@ -88,7 +88,7 @@ class Silence:
         return self.computed_s + self.idle_s
 
     def __str__(self) -> str:
-        """Return the seconds in words, and how busy the machine is, for the message of one who gave up."""
+        """Return the seconds in words, with the load of the machine, for the message of a timeout."""
         load, cores = os.getloadavg()[0], os.cpu_count()
         return (
             f"{self.computed_s:.0f} s of CPU and {self.idle_s:.0f} s in which it did nothing "
@@ -97,7 +97,7 @@ class Silence:
 
 
 def ends(thread: threading.Thread) -> Callable[[float], bool]:
-    """Return what waits for the end of a thread, for `wait_patiently`."""
+    """Return a function that waits for the end of a thread, for `wait_patiently`."""
 
     def arrives(seconds: float) -> bool:
         thread.join(seconds)
@@ -112,12 +112,12 @@ def wait_patiently(
     """Wait until something arrives, for at most `limit_s` as `Silence` counts them.
 
     Args:
-        arrives: waits for it, at most so many seconds, and returns whether it has come.
-        limit_s: patience with those that it is waited for.
-        use: what they have used of the machine.
+        arrives: waits for it, at most the given seconds, and returns whether it has arrived.
+        limit_s: patience with the processes.
+        use: of the machine by the processes.
 
     Returns:
-        None if it has come, else the silence that took too long.
+        None if it has arrived, else the silence that exceeded the limit.
     """
     silence = Silence()
     while not arrives(min(LOOK_EVERY_S, limit_s)):

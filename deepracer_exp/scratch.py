@@ -1,6 +1,6 @@
-"""What a command keeps outside of its run folder while it runs: temporary files and semaphores.
+"""A command's temporary files and semaphores outside of its run folder.
 
-The files lie in a folder of the command's own, so that the next command can clear away what a killed one has left.
+The files lie in a folder of the command's own, so that the next command can clear the remains of a killed one.
 """
 
 import atexit
@@ -17,16 +17,15 @@ from pathlib import Path
 
 _PREFIX = "deepracer_exp-"
 _SEMAPHORE = re.compile(r"sem\.mp-[a-z0-9_]{8}")
-"""What the semaphores of Python's `multiprocessing` are called; TorchRL makes four for cars in several processes."""
+"""Name of a semaphore of Python's `multiprocessing`; TorchRL makes four for cars in several processes."""
 _LONGEST_BASE = 50
 """Bytes of the path above: the name of a fork server's socket, 55 below it, has at most 107 (unix(7))."""
 
 
 def own_scratch() -> None:
-    """Keep the temporary files of this process in a folder that ends with it; clear away what killed processes left.
+    """Keep the temporary files of this process in a folder that ends with it; clear the remains of killed processes.
 
-    What it starts through `multiprocessing` uses the folder, too. Other programs do not: Ray finds its cluster in the
-    usual one.
+    Processes of `multiprocessing` use the folder, too. Other programs do not: Ray finds its cluster in the usual one.
     """
     base = Path(tempfile.gettempdir())
     clear(base, _PREFIX)
@@ -42,9 +41,9 @@ def own_scratch() -> None:
 
 @contextmanager
 def folder_aside(parent: Path, prefix: str) -> Iterator[Path]:
-    """Make a folder for what is moved into place whole, with a name that begins with `prefix`; remove what is left.
+    """Make a folder whose content is moved into place whole, with a name that begins with `prefix`; remove the rest.
 
-    What killed commands have left of such folders is removed, too.
+    Such folders of killed commands are removed, too.
 
     Raises:
         OSError: it cannot be made.
@@ -76,10 +75,10 @@ def clear(parent: Path, prefix: str) -> None:
 
 
 def clear_semaphores(folder: Path) -> None:
-    """Remove this user's semaphores of `multiprocessing` that no process has open; of no effect but on Linux.
+    """Remove this user's semaphores of `multiprocessing` that no process has open; on Linux only.
 
-    Python's resource tracker removes them, unless it is killed as well. Until then the process that made one has it
-    open, so that one that nobody has open is of no use to anybody.
+    Python's resource tracker removes them, unless it is killed as well. A semaphore in use is open in the process that
+    made it, so that one that no process has open is useless.
     """
     for file in folder.glob("sem.mp-*"):
         if not _SEMAPHORE.fullmatch(file.name):
@@ -89,7 +88,8 @@ def clear_semaphores(folder: Path) -> None:
             try:
                 if os.fstat(opened).st_uid == os.getuid():
                     # A lease to read is refused as long as any process, also of another container, can write: fcntl(2).
-                    # Who opens the file meanwhile causes a signal, which would be SIGIO and end this process.
+                    # A process that opens the file meanwhile causes a signal, which would be SIGIO and end this
+                    # process.
                     fcntl.fcntl(opened, fcntl.F_SETSIG, signal.SIGCHLD)
                     fcntl.fcntl(opened, fcntl.F_SETLEASE, fcntl.F_RDLCK)
                     file.unlink()
@@ -98,10 +98,10 @@ def clear_semaphores(folder: Path) -> None:
 
 
 def _hold(folder: Path) -> int:
-    """Lock a folder as long as this process or one that it forked lives; return what holds it.
+    """Lock a folder as long as this process or one that it forked lives; return the lock.
 
     Raises:
-        OSError: a command that clears has taken it at this moment.
+        OSError: another command is clearing it at this moment.
     """
     opened = os.open(folder, os.O_RDONLY)
     fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)

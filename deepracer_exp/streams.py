@@ -1,4 +1,4 @@
-"""The standard streams of a command: what a text may hold that is shown, and what happens where none can be written."""
+"""The standard streams of a command: safe characters, and what happens when a stream cannot be written."""
 
 import errno
 import os
@@ -26,12 +26,12 @@ def without_accounts(text: str) -> str:
 
 
 def shown(text: str) -> str:
-    """Return a text that may hold a stranger's, such as a file's, as it may be shown in a terminal."""
+    """Return a text of unknown origin, such as a file's, in a form that is safe in a terminal."""
     return without_accounts(_CONTROLS.sub("\N{REPLACEMENT CHARACTER}", text))
 
 
 class Output:
-    """A standard stream that takes everything: once nothing can be written, what is written goes nowhere.
+    """A standard stream that never fails: once it cannot be written, further text is discarded.
 
     So no command ends halfway, and no part of it is blamed, because its reader has left (`| head`) or a disk is full.
     """
@@ -39,7 +39,7 @@ class Output:
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
         self.failure: OSError | None = None
-        """Why nothing can be written; None: all was."""
+        """Why the stream cannot be written; None: it can."""
 
     def write(self, text: str) -> int:
         """Write a text as it is."""
@@ -50,7 +50,7 @@ class Output:
         return len(text)
 
     def flush(self) -> None:
-        """Write what waits."""
+        """Flush the stream."""
         try:
             self._stream.flush()
         except OSError as error:
@@ -68,7 +68,7 @@ class Output:
 
 
 class ShownOutput:
-    """An `Output` for `print`: of a text it writes what may be shown."""
+    """An `Output` for `print` that writes texts in their safe form."""
 
     def __init__(self, stream: TextIO) -> None:
         self.as_is = Output(stream)
@@ -90,7 +90,7 @@ class ShownOutput:
 
 @contextmanager
 def standard_streams() -> Iterator[Output]:
-    """Have both standard streams be a `ShownOutput` within the block; yield that of the output."""
+    """Make both standard streams a `ShownOutput` within the block; yield that of the output."""
     for number in range(3):  # a file that is opened later must not become the output
         try:
             os.fstat(number)

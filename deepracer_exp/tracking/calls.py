@@ -1,4 +1,4 @@
-"""Calls of an MLflow store: each of them ends, and each error is one sentence."""
+"""Calls to an MLflow store, each with a time limit and one-sentence errors."""
 
 import logging
 import re
@@ -35,7 +35,7 @@ class StoreRefusedError(Exception):
 
 
 class BoundedClient:
-    """A client of MLflow of which every call ends.
+    """A client of MLflow whose calls all have a time limit.
 
     Its methods raise TimeoutError, which is an OSError, when their time is up.
     """
@@ -135,7 +135,7 @@ def _sentence(error: BaseException) -> str:
 
 
 def _said(text: str) -> str:
-    """Return what a server said besides its error code, from MLflow's message; it may have sent a page."""
+    """Extract the server's own text, beside its error code, from MLflow's message; it may be a page."""
     quoted = re.search(r"Response body: '(.*)'", text)
     words = re.sub(r"<[^>]*>", " ", quoted[1]) if quoted else ""
     # Control characters would reach the terminal.
@@ -149,7 +149,7 @@ def redacted_line(error: BaseException) -> str:
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:
-    """Return an error and those that led to it; urllib3 keeps some as `reason`."""
+    """Return an error and its causes; urllib3 keeps some as `reason`."""
     while error is not None:
         yield error
         error = error.__cause__ or error.__context__

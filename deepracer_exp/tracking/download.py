@@ -1,6 +1,6 @@
-"""Download a registered checkpoint and its run's files from MLflow, where the run's folder is not.
+"""Download a registered checkpoint and its run's files from MLflow, for a run without a folder here.
 
-It is done by a process of its own: that one can be ended whatever it waits for, and the kernel limits what it writes.
+A separate process does it: it can be ended whatever it waits for, and the kernel limits its writes.
 """
 
 import json
@@ -45,7 +45,7 @@ _MODULE = "deepracer_exp.tracking.download"
 
 @dataclass(frozen=True)
 class Download:
-    """A download: the files, and where they are."""
+    """A download: the files and their origin."""
 
     uri: str
     """Address of the store, with the password of a database: it comes on standard input, which `ps` does not show."""
@@ -57,7 +57,7 @@ class Download:
     sha256: str
     """Hash of the checkpoint."""
     with_run: bool
-    """Whether the run's files are wanted as well."""
+    """Whether to download the run's files as well."""
     most_bytes: int = 512 * 2**20
     """Limit for all files together; the largest checkpoint of the project, one that sees pictures, has 30 MB."""
 
@@ -68,7 +68,8 @@ def download(what: str, wanted: Download, store: Store, target: Path) -> None:
     Its hashes are compared, and it is moved into place whole. `what` begins the message.
 
     Raises:
-        BadInput: the store lacks a file, does not answer in time, or sends what is not the registered checkpoint.
+        BadInput: the store lacks a file, does not answer in time, or sends something other than the registered
+            checkpoint.
     """
     what = f"{what}: MLflow ({store.shown})"
     with ExitStack() as stack:

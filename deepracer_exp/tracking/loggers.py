@@ -20,13 +20,13 @@ from .tracking_file import TrackedRun
 
 
 class LoggerProjection(RunProjection):
-    """What a logger of TorchRL has of a run; each process that records the run opens one of its own."""
+    """The record of a run in a TorchRL logger; each process that records the run opens one of its own."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
         self._logger: Any = None
         self._rows_logged, self._last_logged = 0, dict[str, float]()
-        """Number of rows of metrics.jsonl that it has, and the values of the last of them."""
+        """Number of recorded rows of metrics.jsonl, and the values of the last one."""
         self._tags: dict[str, str] = {}
         self._is_closed = False
 
@@ -48,7 +48,7 @@ class LoggerProjection(RunProjection):
         return {}
 
     def _new_values(self, tracked: TrackedRun) -> Iterator[tuple[int, dict[str, float]]]:
-        """Yield the step and the values of each row that the logger lacks, or lacks something of."""
+        """Yield step and values of each row that the logger lacks at least in part."""
         # The last row is read again: it gets an evaluation when the run ends.
         for number, row in enumerate(self._rows(tracked), 1):
             if number < self._rows_logged:

@@ -133,20 +133,20 @@ def lineage_tags(lineage: Lineage) -> dict[str, str]:
 
 
 def user_tags() -> dict[str, str]:
-    """Return the tags of every run that say whose it is: `mlflow.user`, which fills a column of MLflow, and `host`."""
+    """Return the tags with the owner of a run: `mlflow.user`, which fills a column of MLflow, and `host`."""
     who = who_and_where()
     return {"mlflow.user": who["user"], HOST: who["host"]}
 
 
 def label_tags(labels: Labels) -> dict[str, str]:
-    """Return the tags of a run that say what people say of it."""
+    """Return the tags with the labels that people give a run."""
     values = {NAME: labels.name, USER_NOTE: labels.note}
     tags = {key: value for key, value in values.items() if value is not None}
     return tags | labels.named_tags
 
 
 _COMPARED = ("name", "seed", "network", "algorithm", "lr_schedule", "reward.constants", "budget.env_steps")
-"""Keys and groups that racers vary: always recorded as parameters."""
+"""Keys and groups that are often varied: always recorded as parameters."""
 
 
 def run_params(
@@ -199,7 +199,7 @@ WORKFLOW = "workflowType=machine_learning"
 an experiment changes that."""
 
 OURS = "Trainings of `deepracer-exp`."
-"""Beginning of an experiment's description that was not edited."""
+"""Beginning of an experiment's description, unless it was edited."""
 
 _RACE = {
     "lap_time_s": "mean usual lap {:.2f} s",
@@ -222,7 +222,7 @@ def race_result(metrics: Mapping[str, float | None]) -> str:
 
 
 def result_note(summary: Mapping[str, Any], run_id: str, files: Collection[str]) -> str:
-    """Return the result of a run, for the top of its description; `files` are the names of those that MLflow has."""
+    """Return the result of a run, for the top of its description; `files` are the names of its artifacts in MLflow."""
     best = summary.get("best")
     lines = [f"**{summary['status']}**: {summary['reason']}"]
     if best is not None:

@@ -1,4 +1,4 @@
-"""Metrics of a run: their names in MLflow, and the points recorded of them."""
+"""Metrics of a run: their names and points in MLflow."""
 
 import math
 import re
@@ -80,13 +80,13 @@ Within `race` the order of recording matters: the comparison of runs opens with 
 """
 
 MACHINE = "system/"
-"""Prefix of the use of the machine: recorded beside the rows, no part of the run's record."""
+"""Prefix of the machine's load: recorded beside the rows, not part of the run's record."""
 
 BEST = "race/best/"
 """Prefix of the evaluation of the best checkpoint, recorded when the run ends."""
 
 TRACK_METRICS = ("completion", "lap_share", "best_lap_time_s", "mean_lap_time_s")
-"""Metrics that a run on several tracks has for each of them: column `completion/Oval_track`, in MLflow
+"""Metrics recorded per track in a run on several tracks: column `completion/Oval_track`, in MLflow
 `train/completion/Oval_track`, so that all tracks are in one group."""
 
 

@@ -2,8 +2,8 @@
 
 Importing this module imports MLflow, which takes two seconds, so a training leaves it to another process (`project`).
 Every call may be repeated: MLflow keys a metric point by run, key, step, timestamp and value, and parameters, tags,
-files and the end status are the same when written twice. So a request of a killed process that a slow server handles
-late does no harm either.
+files and the end status are the same when written twice. So a late request of a killed process on a slow server does no
+harm either.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -65,7 +65,7 @@ class MLflowRun:
             return client_of(self._store)
 
     def open(self, tracked: TrackedRun, run_id: str | None = None) -> None:
-        """Create the run, or continue it if the store has it already, with or without an answer that said so.
+        """Create the run, or continue it if the store has it already, even if its answer was lost.
 
         `run_id`: the id of an earlier answer.
         """
@@ -83,7 +83,7 @@ class MLflowRun:
                 del self._tags[END_TAG]
 
     def read(self, run_id: str) -> None:
-        """Read a run of the store, which stays as it is, ended or not."""
+        """Open a run of the store without changing its state."""
         with store_errors():
             run = self._client.get_run(run_id)
         if run.info.lifecycle_stage != "active":
@@ -110,7 +110,7 @@ class MLflowRun:
         self.open(tracked, oldest)
 
     def lacking(self, points: Sequence[Point]) -> list[Point]:
-        """Return the points of which the store has none of the same metric and step."""
+        """Return the points whose metric and step the store lacks."""
         with store_errors():
             for key in {point[0] for point in points} - self._steps.keys():
                 history = [] if self._is_new else self._client.get_metric_history(self.run_id, key)
@@ -123,7 +123,7 @@ class MLflowRun:
         params: Mapping[str, str] | None = None,
         tags: Mapping[str, str] | None = None,
     ) -> None:
-        """Write points, and what the store lacks of parameters and tags, in one request if it takes that many."""
+        """Write points and missing parameters and tags, in one request if the store accepts that many."""
         left = list(points)
         # A parameter never changes in MLflow.
         new_params = [item for item in (params or {}).items() if item[0] not in self._params]
@@ -166,7 +166,7 @@ class MLflowRun:
     def conclude(self, tracked: TrackedRun, summary: Mapping[str, Any], files: Collection[str]) -> None:
         """Record the best checkpoint, in the metrics and the descriptions of the run and of its experiment.
 
-        `files` are the names of those that the store has. An edited description is kept.
+        `files` are the names of its artifacts in the store. An edited description is kept.
         """
         points: list[Point] = []
         if best := summary.get("best"):

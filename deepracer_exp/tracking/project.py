@@ -1,4 +1,4 @@
-"""The process that records runs: it reads what they write into their folders, and brings trackers up to date.
+"""The process that records runs: it reads their folders and brings trackers up to date.
 
 A training must not wait for a tracker: MLflow takes two seconds to import, its calls are mostly Python, and its server
 may be down, slow or come back later. So the training only writes its folder, and names the folder to this process
@@ -94,7 +94,7 @@ def _opened(line: dict[str, Any]) -> "RunProjection":
 
 
 def _has_answered(projection: "RunProjection") -> bool:
-    """Bring a tracker up to date; return whether that need not be repeated because its server did not answer."""
+    """Bring a tracker up to date; return False if the server did not answer, so that it must be repeated."""
     from deepracer_exp.errors import BadInput
 
     from .calls import StoreUnavailableError, redacted_line
@@ -121,7 +121,7 @@ def _main() -> None:
 def _read(lines: Lines) -> None:
     for text in sys.stdin:
         lines.put(json.loads(text))
-    os._exit(0)  # the owner has ended; whatever a call still waits for
+    os._exit(0)  # the owner has ended, even if a call still waits
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What a tracker has of a run as a projection of the run's folder: one function brings it up to date."""
+"""A tracker's record of a run as a projection of the run's folder: one function brings it up to date."""
 
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
@@ -43,7 +43,7 @@ _FILES = (CONFIG, OVERRIDES, PROVENANCE, REWARD, SUMMARY, METRICS, LOG, REPORT, 
 
 
 def files_to_keep(run_dir: Path) -> list[tuple[Path, str | None]]:
-    """Return the files and folders of an ended run that a tracker keeps, each with its folder there."""
+    """Return the files and folders of an ended run that a tracker stores, each with its folder there."""
     files: list[tuple[Path, str | None]] = [(run_dir / name, None) for name in _FILES]
     files.append((run_dir / CRASH_DUMPS, CRASH_DUMPS))
     files += [((run_dir / CHECKPOINTS / link).resolve(), f"{CHECKPOINTS}/{link}") for link in LINKS]
@@ -51,7 +51,7 @@ def files_to_keep(run_dir: Path) -> list[tuple[Path, str | None]]:
 
 
 class RunProjection:
-    """What a tracker has of the run of a folder; a class of its own for each kind of tracker.
+    """The projection of a run's folder to a tracker; one class for each kind of tracker.
 
     Only rows of metrics.jsonl that a checkpoint covers are recorded, so that no resumed run contradicts them, and all
     rows once the run is over.
@@ -60,7 +60,7 @@ class RunProjection:
         kind: of the tracker, as in `tracking.kind`.
         folder: of the run.
         has_ended: whether the run has ended.
-        is_done: whether its end was recorded, as far as it can be.
+        is_done: whether its end was recorded, as far as possible.
     """
 
     kind: str
@@ -70,7 +70,7 @@ class RunProjection:
         self.has_ended = self.is_done = False
 
     def update(self) -> str | None:
-        """Record what the tracker lacks; return what it refuses, the first of it, and why.
+        """Record everything missing in the tracker; return the first refusal and its reason.
 
         This may be done at any time and again after any failure, by one process at a time. The file of its kind has
         the outcome from then on (`Recorded`).
@@ -92,9 +92,9 @@ class RunProjection:
         return problem
 
     def give_up(self, problem: str) -> None:
-        """Record a problem that no retry would mend; of a run that has ended, nothing more is attempted."""
+        """Store a problem that no retry would solve; nothing more is attempted for an ended run."""
         self.is_done = self.has_ended
-        with suppress(BadInput):  # whatever else is lost, the folder may be gone
+        with suppress(BadInput):  # the folder itself may be gone
             tracked = read_tracked_run(self.folder)
             self._note(tracked, end_ms=tracked.end_ms, problem=problem)
 
@@ -104,7 +104,7 @@ class RunProjection:
         return None
 
     def _project(self, tracked: TrackedRun) -> Mapping[str, str]:
-        """Record what the tracker lacks; return what it refuses, with the reasons."""
+        """Record everything missing in the tracker; return all refusals with their reasons."""
         raise NotImplementedError
 
     def _note(self, tracked: TrackedRun, end_ms: int | None, problem: str | None) -> None:
@@ -120,7 +120,7 @@ class RunProjection:
         rows = read_metrics(file) if file.exists() else []
         if tracked.status == "FINISHED":
             return rows
-        # The last policy of an interrupted run is evaluated out of turn, and a resumed run removes that again.
+        # An interrupted run evaluates its last policy off schedule, and a resumed run removes that again.
         return [
             row if self._every and row["iteration"] % self._every == 0 else without_evaluation(row)
             for row in rows[: self._covered()]
@@ -142,7 +142,7 @@ class RunProjection:
 
 
 class MLflowProjection(RunProjection):
-    """The MLflow run of a run folder. MLflow is asked which points it has of a run that another process recorded.
+    """The MLflow run of a run folder. MLflow is asked for the points of a run that another process recorded.
 
     Attributes:
         written: number of points of metrics.jsonl that were written.
@@ -159,7 +159,7 @@ class MLflowProjection(RunProjection):
         self._covered_rows = 0
         """Number of rows of metrics.jsonl that MLflow has."""
         self._files: set[tuple[Path, str | None]] = set()
-        """Files that it has."""
+        """Files in MLflow."""
         self._is_shown = False
         """Whether the experiment has the view of a group."""
         self._winner: str | None = None
@@ -227,7 +227,7 @@ class MLflowProjection(RunProjection):
     ) -> None:
         """Write the rows that a checkpoint covers, with parameters and tags."""
         values = points_at(tracked.values, tracked.values_step, tracked.end_ms or now_ms())
-        # All of them also when one has changed: in the end another trial may be the best.
+        # All of them even if only one has changed: in the end another trial may be the best.
         news = values if any(run.metrics.get(key) != value for key, value, *_ in values) else ()
         covered = self._covered()
         if covered <= self._covered_rows and tracked.status != "FINISHED":
@@ -256,13 +256,13 @@ class MLflowProjection(RunProjection):
         ]
 
     def _write_group(self, run: "MLflowRun", tracked: TrackedRun) -> Mapping[str, str]:
-        """Write what stands in the experiment and in the runs below this one."""
+        """Write the tags of the experiment and of the runs nested under this one."""
         group = tracked.group
         if group is None:
             return {}
         writes: dict[str, Callable[[], object]] = {}
         if group.study is not None and (not self._is_shown or tracked.status is not None):
-            # At the end as well those trials that began before this run did.
+            # At the end, too, for trials that began before this run did.
             study = {STUDY: group.study}
             writes["the trials"] = lambda: run.adopt(study, but=KIND)
         if group.experiment_tags and not self._is_shown:
@@ -296,7 +296,7 @@ class MLflowProjection(RunProjection):
 
 
 def _refused_of(writes: Mapping[str, Callable[[], object]]) -> dict[str, str]:
-    """Call every function; return the names of those that a store refuses, or that cannot read a file, with reasons."""
+    """Call every function; return the names of those that fail on a refusal or an unreadable file, with reasons."""
     refused = {}
     for what, write in writes.items():
         try:

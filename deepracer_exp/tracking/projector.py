@@ -22,12 +22,12 @@ from .store import Store
 from .tracking_file import Recorded, TrackedRun, read_recorded, write_tracked_run
 
 UPDATE_S = 5.0
-"""Pause between two updates of a tracker that answers; what has come up meanwhile is one request."""
+"""Pause between two updates of a tracker that answers; everything new is one request."""
 _LOOK_S = 0.02
 _MODULE = "deepracer_exp.tracking.project"
 
 Target = Store | TensorBoardTracking | WandbTracking
-"""Where a run is recorded."""
+"""The target of a run's records."""
 
 
 def kind_of(target: Target) -> str:
@@ -55,7 +55,7 @@ class Projector:
         self.end()
 
     def begin(self, folder: Path, target: Target, *, is_training: bool = True) -> None:
-        """Have the run of a folder recorded from now on, in place of the one before.
+        """Start recording the run of a folder, in place of the last one.
 
         `is_training`: it has metrics.jsonl once it has begun, and its start needs the cores itself.
         """
@@ -66,7 +66,7 @@ class Projector:
         self.send({**line, "addresses": taken_out(), "every_s": UPDATE_S, "first": first})
 
     def look(self, folder: Path, target: Target) -> None:
-        """Have a folder recorded now; arguments and errors as for `begin`."""
+        """Record a folder now; arguments and errors as for `begin`."""
         if self._folder == folder and not self.is_lost:
             self.send({})
         else:
@@ -74,7 +74,7 @@ class Projector:
 
     @property
     def is_lost(self) -> bool:
-        """Whether there is no process."""
+        """Whether no process runs."""
         return self._process is None or self._process.poll() is not None
 
     def end(self) -> None:
@@ -89,7 +89,7 @@ class Projector:
             "stdout": subprocess.DEVNULL,
             "stderr": subprocess.DEVNULL,
         }
-        # Not started, or just ended: then it is lost, which costs the training nothing.
+        # Not started, or just ended: the line is lost, which does not harm the training.
         with contextlib.suppress(OSError):
             if self.is_lost:
                 self.end()
@@ -109,7 +109,7 @@ class ProjectedRun:
         self._target, self._projector = target, projector
 
     def begin(self, *, is_training: bool) -> None:
-        """Write `tracking.json` and have the run recorded, that of a training once it begins.
+        """Write `tracking.json` and start recording the run, a training's once it begins.
 
         Raises:
             OSError: the folder cannot be written.
@@ -119,7 +119,7 @@ class ProjectedRun:
 
     @property
     def recorded(self) -> Recorded:
-        """What is recorded so far."""
+        """The record so far."""
         return read_recorded(self.folder, kind_of(self._target))
 
     def change(self, **changes: Any) -> None:
@@ -132,7 +132,7 @@ class ProjectedRun:
         write_tracked_run(self.folder, self.run)
 
     def wait_for_end(self, deadline_s: float) -> str | None:
-        """Have the end of the run recorded; return what was not, and why, None if all was.
+        """Record the end of the run; return a sentence on what was not recorded and why, None if everything was.
 
         It is waited for at most `deadline_s`. The limit is the tracker's: of a process that records and has not enough
         of a core, its CPU time counts.
@@ -147,7 +147,7 @@ class ProjectedRun:
         return reason or recorded.problem or f"no answer within {deadline_s:g} s"
 
     def wait_for_answer(self, deadline_s: float) -> Recorded:
-        """Return what is recorded once the tracker has answered, by creating the run or by refusing it, or in time."""
+        """Return the record once the tracker has created or refused the run, or after the time limit."""
         kind = kind_of(self._target)
 
         def has_answered() -> bool:
@@ -165,7 +165,7 @@ class ProjectedRun:
 
 
 def _comes(what: Callable[[], bool], seconds: float) -> bool:
-    """Return whether something comes within so many seconds."""
+    """Return whether an answer arrives within the given seconds."""
     end = time.monotonic() + seconds
     while not what() and time.monotonic() < end:
         time.sleep(_LOOK_S)

@@ -90,10 +90,10 @@ def check_model(what: str, model: str) -> None:
 
 
 def look_up(reference: str, uri: str | None, runs_dir: Path) -> Registered:
-    """Look up `MODEL@ALIAS`, or `ALIAS` if exactly one model has it, in a store as of `open_client`.
+    """Look up `MODEL@ALIAS`, or `ALIAS` if exactly one model has it, in a store.
 
     Raises:
-        BadInput: no model or several have it, it was not registered by us, or the store does not answer.
+        BadInput: no model or several have it, it was not registered by this program, or the store does not answer.
     """
     model, separator, alias = reference.rpartition("@")
     check_alias(reference, alias)
@@ -118,7 +118,7 @@ def look_up(reference: str, uri: str | None, runs_dir: Path) -> Registered:
 
 
 def _aliases(what: str, uri: str | None, runs_dir: Path) -> list[tuple[str, str]]:
-    """Return model and name of each alias; those of a file are read without MLflow, which takes seconds to import."""
+    """Return model and name of each alias; a file is read without MLflow, which takes seconds to import."""
     if has_store(uri, runs_dir) and (file := existing_store(uri, runs_dir).sqlite_file) is not None:
         with suppress(sqlite3.Error), closing(sqlite3.connect(file)) as database:
             return database.execute("SELECT name, alias FROM registered_model_aliases").fetchall()
@@ -139,8 +139,8 @@ def promote(
 ) -> Registered:
     """Register a checkpoint as a version of a model and give it the alias.
 
-    `name` is `best`, `last`, `fastest` or the number of an iteration; `features` and `seen` describe what the policy
-    sees. The alias is taken from the version that has it.
+    `name` is `best`, `last`, `fastest` or the number of an iteration; `features` and `seen` describe the observation.
+    The alias is taken from the version that has it.
 
     The version is a logged model of MLflow: the checkpoint's files, the run's report and picture, a signature, and the
     checkpoint's evaluation as metrics. The checkpoint is pinned in the run's folder. A checkpoint that already is a
@@ -237,7 +237,7 @@ def _log_model(
         ended_within(CALL_S, partial(files.log_artifacts, aside))
     ended_within(CALL_S, partial(files.log_artifacts, str(checkpoint), "checkpoint"))
     for key, value in metrics.items():
-        # Exactly the run's own point, so that its curve has no duplicate.
+        # The same point as the run's own, so that its curve has no duplicate.
         points = [point for point in client.get_metric_history(run_id, key) if point.value == value]
         moment = (points[-1].timestamp, points[-1].step) if points else (None, None)
         client.log_metric(run_id, key, value, *moment, model_id=logged.model_id)
@@ -301,7 +301,7 @@ def _registered(what: str, version: Any, alias: str) -> Registered:
 
 
 def download_folder(run_dir: Path, runs_dir: Path) -> Path:
-    """Return where in `runs_dir` a run belongs whose folder was elsewhere.
+    """Return the place in `runs_dir` of a run whose folder was elsewhere.
 
     Raises:
         BadInput: its name or that of its experiment is not one that a training gives.
@@ -313,7 +313,7 @@ def download_folder(run_dir: Path, runs_dir: Path) -> Path:
 
 
 def fetch(registered: Registered, uri: str | None, runs_dir: Path) -> Path:
-    """Download a registered checkpoint with its run from a store as of `open_client`; return the run's folder.
+    """Download a registered checkpoint with its run from a store; return the run's folder.
 
     The folder is where it would be if the run had been trained in `runs_dir`.
 

@@ -1,4 +1,4 @@
-"""MLflow stores: where runs are recorded. Addresses without secrets, clients, errors, and how long to wait.
+"""MLflow stores of runs: addresses without secrets, clients, errors and time limits.
 
 MLflow takes seconds to import, so only the code that opens a store imports it.
 """
@@ -87,10 +87,10 @@ class Store:
         )
 
     def files_at(self, place: str) -> "ArtifactRepository":
-        """Return the files that the store keeps at a place, which it names itself.
+        """Return the files that the store keeps at a place of its own choice.
 
-        A server must have them itself: it could name another one, to be given this user's password, or a folder or a
-        bucket, to be read or written in the user's name. Those of a database must be in a folder.
+        A server must hold them itself: it could name another server, to obtain this user's password, or a folder or
+        bucket, to have it read or written in the user's name. Those of a database must be in a folder.
 
         Raises:
             StoreRefusedError: they are elsewhere.
@@ -115,7 +115,7 @@ class Store:
         return get_artifact_repository(place, tracking_uri=self.uri)
 
     def moved_folder(self, place: str) -> Path | None:
-        """Return where the artifacts at a place are now, if the store was moved or copied with its folder; None if not.
+        """Return the present place of artifacts if the store was moved or copied with its folder; None if not.
 
         MLflow stores absolute paths, and has no call that changes that of a run or an experiment. `place` is such a
         path or URI, of a folder in `mlflow-artifacts`.
@@ -127,7 +127,7 @@ class Store:
         now = self.sqlite_file.with_name(ARTIFACTS)
         if root is None or root.resolve() == now.resolve():
             return None
-        # Of another runs_dir that is recorded in this store, unless it lies beside this store's original.
+        # It belongs to another runs_dir recorded in this store, unless it lies beside this store's original.
         if root.exists() and not root.with_name(self.sqlite_file.name).exists():
             return None
         return now / then.relative_to(root)
@@ -219,7 +219,7 @@ def check_database_file(file: Path, shown: str) -> None:
 
 
 def prepare_mlflow() -> None:
-    """Set what MLflow reads from the environment alone, some of it when it is imported."""
+    """Set the options that MLflow reads only from the environment, some of them when it is imported."""
     # Its own 7 retries would hold the queue for minutes after a server is back: `project.serve` retries instead.
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
     # It would print the address of each ended run, with its password.
@@ -270,12 +270,12 @@ def is_run_id(text: str) -> bool:
 
 
 def has_store(uri: str | None, runs_dir: Path) -> bool:
-    """Return whether a store is given or `runs_dir` has one."""
+    """Return whether a store is named or `runs_dir` has one."""
     return uri is not None or (runs_dir / MLFLOW_DB).is_file()
 
 
 def existing_store(uri: str | None, runs_dir: Path) -> Store:
-    """Return a store to read from, as `resolve_store` does for one to record in.
+    """Return a store to read from; `resolve_store` returns one to record in.
 
     Raises:
         BadInput: `uri` can never work, or the file does not exist.
@@ -307,7 +307,7 @@ def open_client(what: str, uri: str | None, runs_dir: Path) -> "Iterator[MlflowC
         )
     store = existing_store(uri, runs_dir)
     try:
-        # Within: its import takes three seconds, and nothing else needs it.
+        # Imported here: it takes three seconds, and nothing else needs it.
         with store_errors():
             yield client_of(store)
     except (StoreRefusedError, StoreUnavailableError) as error:

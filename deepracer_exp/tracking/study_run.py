@@ -19,7 +19,7 @@ from .store import Store
 from .tracking_file import Group, Status, TrackedRun, read_recorded, read_tracked_run
 
 SEARCH, TRIAL = "sweep.search", "sweep.trial"
-"""Tags: a hash of what the study searches, the number of the trial. `sweep.kind` says which a run is."""
+"""Tags: a hash of the study's search, and the number of the trial. `sweep.kind` distinguishes their runs."""
 _SOURCE = {"mlflow.source.name": "deepracer-exp sweep", "mlflow.source.type": "LOCAL"}
 _ENDS = {"FINISHED": "finished", "FAILED": "failed", "KILLED": "interrupted"}
 
@@ -31,7 +31,7 @@ class Progress:
     """Progress of a study."""
 
     total: int
-    """Number of trials it will have."""
+    """Number of trials in the end."""
     complete: int
     pruned: int
     failed: int
@@ -68,7 +68,7 @@ class StudyRun:
     the study continues its run.
 
     Attributes:
-        run_id: MLflow's id of the run, once it was waited for or asked for; None before.
+        run_id: MLflow's id of the run, once it is known; None before.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class StudyRun:
     ) -> None:
         """Start creating or finding the run of a search: expressions by key, and overrides of all trials.
 
-        MLflow cannot create a run only if there is none: the file `lock` lets one process at a time look and create it.
+        MLflow has no atomic look-up and creation: the file `lock` admits one process at a time.
         """
         params = _params(space, base)
         search = hashlib.sha256(json.dumps([dict(space), list(base)], sort_keys=True).encode())
@@ -139,7 +139,7 @@ class StudyRun:
         self._group = replace(self._group, report=str(file.absolute()))
 
     def finish(self, status: Status, deadline_s: float = 30.0) -> bool:
-        """Write what is left for at most `deadline_s`, end the run and return whether it was ended."""
+        """Write the rest within `deadline_s`, end the run and return whether that succeeded."""
         tags = {**self._run.run.tags, END_TAG: _ENDS[status]}
         self._change(tags=tags, group=self._group, status=status, end_ms=now_ms())
         problem = self._run.wait_for_end(deadline_s)
@@ -217,13 +217,13 @@ def end_trial_run(
     projector: Projector,
     deadline_s: float = 30.0,
 ) -> None:
-    """End the run of a trial, or change how it has ended, with its values by metric; errors are logged.
+    """End the run of a trial, or change its ending, with its values by metric; errors are logged.
 
     `folder` describes it: that of `open_trial_run`, or the run folder of the only seed.
     """
     try:
         before = read_tracked_run(folder)
-        # Of a run that is not recorded, `runs send` records this as well.
+        # If the run is not recorded, `runs send` records this as well.
         waits = before.group is not None or read_recorded(folder).has_all_of(before)
         run = ProjectedRun(folder, before, store, projector)
         numbers = {key: value for key, value in values.items() if value is not None}

@@ -1,4 +1,4 @@
-"""Trackers: what a training says of its run while it makes it, and who records that."""
+"""Trackers: the interface by which a training describes its run, and its implementations."""
 
 import importlib.util
 import logging
@@ -33,11 +33,11 @@ class Tracker:
     """
 
     failure: str | None = None
-    """After `finish`: what was not recorded, and why, in one sentence; None: everything was."""
+    """After `finish`: a sentence on what was not recorded and why; None: everything was."""
 
     @property
     def outage(self) -> str | None:
-        """Why something is not recorded at the moment, for which `finish` waits; None: everything is."""
+        """Reason why records are pending, for which `finish` waits; None: nothing is pending."""
         return None
 
     def open(self, folder: Path, run: TrackedRun) -> None:
@@ -57,14 +57,14 @@ class Tracker:
         """Set a tag of the run."""
 
     def finish(self, status: Status, deadline_s: float = FINISH_S) -> None:
-        """Write what is left for at most `deadline_s`, and end the run.
+        """Write the rest within `deadline_s`, and end the run.
 
         A failed or killed run may be resumed from its last checkpoint.
         """
 
 
 class ProjectedTracker(Tracker):
-    """Leaves the recording to another process, which reads the run's folder, and describes the run there."""
+    """Describes the run in its folder, which another process reads and records."""
 
     def __init__(self, target: Target, projector: Projector | None = None) -> None:
         """Record in a target; without a `projector`, which is for several runs, this run has one of its own."""

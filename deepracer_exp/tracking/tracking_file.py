@@ -1,4 +1,4 @@
-"""`tracking.json`, in which a training describes its run to trackers, and `mlflow.json`: what of it is recorded."""
+"""`tracking.json`, a training's description of its run for trackers, and `mlflow.json`, the state of the record."""
 
 import json
 import logging
@@ -22,17 +22,18 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class Group:
-    """What only a run has that stands above others: a study's above its trials', a trial's above its seeds'."""
+    """Further fields of a parent run: a study's, above its trials', or a trial's, above its seeds'."""
 
     marks: tuple[str, ...]
-    """Tags that identify it: a run of its experiment with the same values is continued, whichever process began it."""
+    """Tags that identify the run: one with the same values in its experiment is continued, whichever process began
+    it."""
     lock: str | None = None
     """File that one process at a time locks while it looks for the run and creates it."""
     experiment_tags: dict[str, str] = field(default_factory=dict)
     study: str | None = None
-    """The study whose trials are nested under it; None: those below say it themselves."""
+    """The study whose trials are nested under it; None: nested runs name their parent themselves."""
     winner: str | None = None
-    """The best of them in words, for the description of the experiment."""
+    """The best trial in words, for the description of the experiment."""
     report: str | None = None
     """File that is stored with the run at its end."""
 
@@ -65,20 +66,20 @@ class TrackedRun:
 
 @dataclass(frozen=True)
 class Recorded:
-    """What was recorded of a run, and where: `mlflow.json`, and the like of other trackers."""
+    """The record of a run in a tracker: `mlflow.json`, and the files of other trackers."""
 
     store: str = ""
     """As in `TrackedRun`."""
     run_id: str | None = None
     """MLflow's id of the run; None until MLflow has created it."""
     end_ms: int | None = None
-    """The end of the run that was recorded with all that had come before; None while there is none."""
+    """The ending recorded together with everything before it; None while there is none."""
     problem: str | None = None
-    """What is not recorded, and why, on one line; None: there is nothing."""
+    """A line on what is not recorded and why; None: nothing is missing."""
 
     @property
     def is_refused(self) -> bool:
-        """Whether the tracker has answered and refuses something."""
+        """Whether the tracker has refused something."""
         return self.problem is not None and self.problem.startswith(REFUSED)
 
     def has_all_of(self, run: TrackedRun) -> bool:
@@ -115,7 +116,7 @@ def write_tracked_run(folder: Path, run: TrackedRun) -> None:
 
 
 def read_recorded(folder: Path, kind: str = "mlflow") -> Recorded:
-    """Read what a kind of tracker has recorded of the run of a folder; without entries if that is nothing.
+    """Read a tracker's record of the run of a folder; empty if there is none.
 
     Raises:
         BadInput: a file is invalid.
@@ -128,7 +129,7 @@ def read_recorded(folder: Path, kind: str = "mlflow") -> Recorded:
 
 
 def write_recorded(folder: Path, recorded: Recorded, kind: str = "mlflow") -> None:
-    """Write what a kind of tracker has recorded."""
+    """Write a tracker's record."""
     file = folder / f"{kind}.json"
     try:
         atomic_write(file, json.dumps(asdict(recorded), indent=1) + "\n")
@@ -137,12 +138,12 @@ def write_recorded(folder: Path, recorded: Recorded, kind: str = "mlflow") -> No
 
 
 def note_problem(folder: Path, problem: str) -> None:
-    """Note that MLflow lacks something of an ended run."""
+    """Mark an ended run as incomplete in MLflow."""
     write_recorded(folder, replace(read_recorded(folder), problem=problem))
 
 
 def begin_again(folder: Path, run_dir: Path) -> None:
-    """Turn a copy of a run's folder into that of a run of its own, which will lie at `run_dir`."""
+    """Turn a copy of a run's folder into a run of its own, which will lie at `run_dir`."""
     run = read_tracked_run(folder)
     tags = {**run.tags, "run_dir": str(run_dir.resolve())}
     write_tracked_run(folder, replace(run, run_id=None, tags=tags, complete=False))
