@@ -1,4 +1,4 @@
-"""A lap of a run of ours against the fastest lap of its car: the seconds lost in each sector, and by what."""
+"""A lap of a run of ours against the fastest lap of its car: the seconds lost by sector and cause."""
 
 import shlex
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from .sectors import Sector, sectors_of
 from .statistics import Values
 
 CAUSES = ("line", "speed", "steering")
-"""A longer line; less speed on it; and the way that steering to and fro adds to a line that is smooth."""
+"""A longer line; less speed on it; and the detour by steering to and fro around a smooth line."""
 _SMOOTH_M, _APART_M = 0.6, 0.05
 """Length over which a driven line is averaged to be smooth, and that between its points."""
 _SAME_START_M = 0.05
@@ -37,7 +37,7 @@ class Loss:
 
 @once_per_view
 def question_of(view: LogView, folder: Path) -> Question | None:
-    """Return what the fastest lap of a run's car on the view's course depends on; None where that is not known.
+    """Return the question whose answer is the fastest lap of a run's car on the view's course; None if not known.
 
     Raises:
         BadInput: the action space leaves the car nothing to choose.
@@ -77,9 +77,9 @@ def loss(view: LogView, folder: Path) -> Loss | None:
 
 
 def by_cause(lap: pd.DataFrame, fastest: pd.DataFrame) -> pd.DataFrame:
-    """Divide the time that a lap loses.
+    """Attribute the time that a lap loses.
 
-    Both have of each sector `time_s`, `way_m` and `smooth_m`, the way without what steering to and fro adds.
+    Both have `time_s`, `way_m` and `smooth_m`, the way without the detour of steering, for each sector.
 
     Returns:
         Seconds by `CAUSES`, whose sum is the difference of `time_s`. A longer line costs its length at the speed of the
@@ -137,7 +137,7 @@ def _way_m(points: Values) -> Values:
 
 
 def fastest_in_words(view: LogView, folder: Path) -> str:
-    """Return the fastest lap that was found of a run's car on the track, with its bound, or how it is found."""
+    """Return the fastest known lap of a run's car on the track with its bound, or the command that finds it."""
     try:
         question = question_of(view, folder)
     except BadInput as error:
@@ -149,7 +149,7 @@ def fastest_in_words(view: LogView, folder: Path) -> str:
 
 
 def loss_in_words(view: LogView, folder: Path) -> str:
-    """Return what a run's lap loses to the fastest lap of its car, or how that is found out."""
+    """Return the loss of a run's lap to the fastest lap of its car, or the command that computes it."""
     try:
         question = question_of(view, folder)
     except BadInput as error:
@@ -161,7 +161,7 @@ def loss_in_words(view: LogView, folder: Path) -> str:
 
 
 def lost_in_words(lost: Loss) -> str:
-    """Return in a sentence what is lost, and where most."""
+    """Return a sentence with the losses and the worst sector."""
     total, causes = lost.lap_time_s - lost.fastest.lap_time_s, lost.by_sector.sum()
     by_sector = lost.by_sector.sum(axis=1)
     parts = ", ".join(f"{causes[name]:+.2f} s {name}" for name in CAUSES)

@@ -1,4 +1,4 @@
-"""What a log holds beside the laps of its training: evaluations, races, and other tracks."""
+"""The evaluations, races and other tracks in the log of a training."""
 
 import math
 
@@ -11,7 +11,7 @@ from .log_view import LogView
 
 
 def raced_beside(view: LogView) -> str:
-    """Return how the races and evaluations beside a training went, in words; "" without one."""
+    """Summarise the races and evaluations beside a training in words; "" without one."""
     raced = view.evaluation_episodes
     if not view.trained or not len(raced):
         return ""
@@ -26,7 +26,7 @@ def raced_beside(view: LogView) -> str:
 
 
 def evaluated_in_training(view: LogView) -> str:
-    """Return what the evaluations of a training say of its best checkpoint, in words; "" without one."""
+    """Return the evaluation of a training's best checkpoint in words; "" without one."""
     if view.run is not None:
         best = view.run.best
         return "" if best.iteration is None else f"{best.iteration:06d}: {best.words()}"
@@ -42,7 +42,7 @@ def evaluated_in_training(view: LogView) -> str:
 
 
 def other_tracks(view: LogView) -> str:
-    """Return which logs of a recording were driven on other tracks, in words; "" if none was."""
+    """Name the logs of a recording from other tracks, in words; "" if there are none."""
     steps = view.recording.steps
     starts = [part.first_iteration for part in view.recording.rounds]
     words = []

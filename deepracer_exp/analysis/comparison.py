@@ -42,13 +42,12 @@ RESULTS: tuple[tuple[str, str, str, int], ...] = (
     ("return", "last mean_return", "{:.1f}", 0),
     ("entropy, nats", "last entropy", "{:.2f}", 0),
 )
-"""The results that are compared: of the evaluation of the best checkpoint, and of the last iteration of the training.
-Each has a name, a key of `_values`, a format, and whether a higher value is better (1), a lower one (-1), or neither
-(0)."""
+"""The compared results: of the best checkpoint's evaluation, and of the last iteration of the training. Each has a
+name, a key of `_values`, a format, and whether a higher value is better (1), a lower one (-1), or neither (0)."""
 
 
 def _values(record: RunRecord) -> dict[str, Any]:
-    """Return the results of a run by key; those that it does not have are missing or None."""
+    """Return the results of a run by key; unknown ones are missing or None."""
     summary, result = record.summary, result_of(record.summary)
     columns = {key.partition("/")[0] for key in record.rows[-1]}
     last = {column: last_value(record, column) for column in columns}

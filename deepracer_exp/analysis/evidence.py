@@ -4,8 +4,8 @@ Definitions: Agarwal et al., Deep Reinforcement Learning at the Edge of the Stat
 strata: one array a track, one value a seed. Seeds are resampled within their track, never from one track to another.
 
 The percentiles of an interval are moved outwards for few seeds (Hesterberg, What Teachers Should Know About the
-Bootstrap, 2015, "expanded percentile interval"): those of the plain one take 5 seeds against 5 of the same distribution
-for different in 6 to 12 per cent of cases, and 3 against 3 in 20.
+Bootstrap, 2015, "expanded percentile interval"): the plain ones call 5 seeds against 5 of the same distribution
+different in 6 to 12 per cent of cases, and 3 against 3 in 20.
 """
 
 import math
@@ -25,12 +25,13 @@ TOO_FEW = "too few runs to tell"
 _TRIMMED = 0.25
 
 Strata = Sequence[Values]
-"""Scores by track, (seeds,) each; infinity where a seed has none and that is worse than any, as a lap never driven."""
+"""Scores by track, (seeds,) each; infinity stands for a missing score that is worse than any, as of a lap never
+driven."""
 Interval = tuple[float, float]
 
 
 def interquartile_mean(scores: Values, axis: int = -1) -> Values:
-    """Return the mean of the middle half of scores along an axis: a quarter of them is left out at either end."""
+    """Return the mean of the middle half of scores along an axis, without a quarter of them at either end."""
     scores = np.moveaxis(np.asarray(scores, np.float64), axis, -1)
     seeds = scores.shape[-1]
     left_out = int(_TRIMMED * seeds)
@@ -97,15 +98,16 @@ class Difference:
     interval: Interval | None
     """95 per cent; None where unknown."""
     probability: float
-    """That a run of the group scores better than one of the other on the same track, ties counting half; the mean over
-    tracks. Called the probability of improvement."""
+    """Probability of improvement: that a run of the group scores better than one of the other on the same track, ties
+    counting half; the mean over tracks."""
     probability_interval: Interval | None
     enough: bool
-    """Whether there are enough seeds: with fewer, groups that do not overlap at all are no rarer than one in twenty."""
+    """Whether there are enough seeds: with fewer, even groups without overlap occur by chance in one of twenty
+    cases."""
 
     @property
     def explained_by_seeds(self) -> bool:
-        """Whether seeds alone explain it: an interval holds what there would be without a difference."""
+        """Whether seeds alone explain the difference: an interval contains its null value."""
         if not self.enough or self.probability_interval is None:
             return True
         low, high = self.probability_interval
@@ -143,7 +145,7 @@ def difference(scores: Strata, other: Strata, lower_is_better: bool) -> Differen
         (tuple(np.sort(values)), tuple(np.sort(others))) for values, others in zip(scores, other, strict=True)
     ]
     pairs, turned = sorted(cells), sorted(cell[::-1] for cell in cells)
-    if turned < pairs:  # which group is named first decides nothing but signs
+    if turned < pairs:  # the order of the groups decides only signs
         return difference(other, scores, lower_is_better).reversed()
     ours, theirs = ([np.array(cell) for cell in side] for side in zip(*pairs, strict=True))
     both, rng = [*ours, *theirs], np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""A finding of a log, what it costs the racer, and the order of several."""
+"""A finding of a log with its cost, and the order of findings."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -21,7 +21,7 @@ FIGURES = {
     "overfits": "training_progress",
     "laps_slower": "training_progress",
 }
-"""The chart that shows what a rule found."""
+"""The chart of each rule's finding."""
 Numbers = dict[str, float | int | str]
 
 
@@ -36,7 +36,7 @@ class Finding:
     """The numbers that were compared."""
     thresholds: Mapping[str, float | int] = field(default_factory=dict)
     cost_percent: float = 0.0
-    """What it costs the racer, in per cent of completion, of laps that fail, or of the lap time; 0: it is no loss."""
+    """Its cost in per cent of completion, of failed laps, or of the lap time; 0: it is no loss."""
     to_do: str = ""
     """The finding with what to do about the training as a whole, which the first of all findings says in place of
     `sentence`; empty: there is nothing to do about it."""
@@ -48,10 +48,10 @@ class Finding:
 
 
 def in_order(of_training: Sequence[Finding], of_driving: Sequence[Finding]) -> list[Finding]:
-    """Return findings as a page lists them: what to do first, then by what they cost.
+    """Return findings in the order of a page: advice first, then by cost.
 
-    What to do is that of the costliest finding of the training, or of the first of these where none costs anything. The
-    others do not say theirs: a racer can do one thing at a time, and it may be the opposite. A finding that costs
+    The advice is that of the costliest finding of the training, or of the first of these where none costs anything. The
+    others keep theirs back: a racer can do one thing at a time, and it may be the opposite. A finding that costs
     something, but less than `LEAST_LOSS_PERCENT`, is left out.
     """
     to_do = [finding for finding in of_training if finding.to_do]

@@ -28,9 +28,9 @@ MOST_LOST = 3
 
 
 def findings(view: LogView, target_s: float | None = None) -> list[Finding]:
-    """Apply all rules to a log; what to do is first, then what costs most (`finding.in_order`).
+    """Apply all rules to a log; advice comes first, then the costliest finding (`finding.in_order`).
 
-    `target_s` is the lap time wanted, if there is one.
+    `target_s` is the desired lap time, if there is one.
     """
     of_training = training_findings(view, _submit(view)) if view.trained else []
     of_driving = [_time_lost(view)]
@@ -121,7 +121,7 @@ def _nothing_to_submit(view: LogView, thresholds: Mapping[str, float]) -> Findin
 
 
 def _iterations(view: LogView, last: int) -> str:
-    """Return what a row of `view.judged` stands for."""
+    """Return the iterations of a row of `view.judged` in words."""
     if not view.in_blocks:
         return f"iteration {last}"
     before = view.judged["iteration"][view.judged["iteration"] < last].max()
@@ -144,7 +144,7 @@ def _checkpoint(view: LogView, name: str) -> str:
 
 
 def _chance(view: LogView, target_s: float | None) -> Finding | None:
-    """Say how fast the laps are; with a target, how likely one within it is, measured and by a normal distribution."""
+    """Report the speed of laps, and with a target its probability, measured and by a normal distribution."""
     episodes, when = view.now(LEAST_LAPS)
     laps_s = episodes["lap_time_s"].dropna().to_numpy(np.float64)
     laps = len(laps_s)
@@ -219,7 +219,7 @@ def _time_lost(view: LogView) -> Finding | None:
 
 
 def _costliest(view: LogView) -> Finding | None:
-    """Say which of the others costs most of the crashes of the last third of the iterations, or of an evaluation."""
+    """Name the object with most crashes in the last third of the iterations, or in an evaluation."""
     if view.others is None:
         return None
     late = thirds(view.steps["iteration"].to_numpy()) == 2
@@ -235,7 +235,7 @@ def _costliest(view: LogView) -> Finding | None:
 
 
 def _crashes(view: LogView) -> Finding | None:
-    """Say in how many finished episodes of the whole log the car crashed, and how often at one object."""
+    """Count the finished episodes of the whole log with a crash, and the crashes at one object."""
     episodes = view.episodes.loc[view.episodes["ended"], "episode"]
     crashed_now = (view.steps["episode_status"] == "crashed").to_numpy()
     rows = view.steps[begins_of(crashed_now, first_rows(view.steps))]
@@ -334,7 +334,7 @@ def _in(sectors: Sequence[Sector], place: OffTrackPlace) -> str:
 
 
 def _share(share: float) -> str:
-    """Return it in per cent, with a digit more near 0 and 100%."""
+    """Return the share in per cent, with one more digit near 0 and 100%."""
     if 0.1 <= share <= 0.99 or share in (0, 1):
         return f"{share:.0%}"
     return f"{share:.1%}" if share >= 0.001 else "below 0.1%"

@@ -15,7 +15,7 @@ from .log_tables import NONE, Table
 
 
 def scored(groups: Sequence[RunGroup]) -> Table:
-    """Return what each group scored: interquartile means over its runs, with their intervals, on each track."""
+    """Return the scores of each group: interquartile means over its runs, with intervals, on each track."""
     several = len(courses_of(groups)) > 1
     rows = []
     for group in groups:
@@ -67,7 +67,7 @@ def differences_table(comparisons: Sequence[Comparison]) -> Table:
 
 
 def title_of(comparisons: Sequence[Comparison]) -> str:
-    """Return what a table of comparisons is about: ``new against old``, or ``Against old`` of several groups."""
+    """Return the title of a table of comparisons: ``new against old``, or ``Against old`` for several groups."""
     names = {comparison.group for comparison in comparisons}
     return (
         f"{names.pop()} against {comparisons[0].other}"
@@ -77,7 +77,7 @@ def title_of(comparisons: Sequence[Comparison]) -> str:
 
 
 def sentences(groups: Sequence[RunGroup], comparisons: Sequence[Comparison]) -> list[str]:
-    """Return what the tables say, in sentences: first how each group differs from the first one, and if by chance."""
+    """Summarise the tables in sentences: first each group's differences from the first, and whether they are chance."""
     alone = len(courses_of(groups)) == 1
     single = all(len(group.records) == 1 for group in groups)
     verdicts: dict[str, list[Comparison]] = {}
@@ -106,7 +106,7 @@ def sentences(groups: Sequence[RunGroup], comparisons: Sequence[Comparison]) -> 
 
 
 def groups_as_json(groups: Sequence[RunGroup], comparisons: Sequence[Comparison]) -> dict[str, Any]:
-    """Return everything that is compared, JSON types; infinite seconds, of laps never completed, are null."""
+    """Return the whole comparison as JSON types; infinite seconds, of laps never completed, are null."""
     curves = curves_table(groups)
     return {
         "groups": [

@@ -1,4 +1,4 @@
-"""Groups of runs that differ in their seeds: which there are, what they scored, and whether they differ."""
+"""Groups of runs that differ in their seeds: names, scores and differences."""
 
 import json
 import math
@@ -24,7 +24,7 @@ _NOT_OF_GROUP = ("seed", "name", "code")
 _UNNAMED = ("seed", "name", "runs_dir", "tracking", "report", "debug", "track")
 """Keys of overrides that are no part of a group's name."""
 _MOST_WORDS, _MOST_LETTERS = 3, 44
-"""Settings in the name of a group, and their letters in all; there is at least one."""
+"""Most settings in the name of a group, and most letters in all; there is at least one setting."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +77,8 @@ def course_of(record: RunRecord) -> str:
 def group_runs(named: Iterable[tuple[str | None, RunRecord]]) -> list[RunGroup]:
     """Put runs into groups.
 
-    Each run comes with the name of the group that it was given to; None: it belongs to the runs of the same settings
-    but for seed, track, experiment and version of the code.
+    Each run comes with the name of its group; None: it joins the runs whose settings differ in seed, track, experiment
+    and version of the code only.
     """
     pairs = list(named)
     records = [record for _, record in pairs]
@@ -114,7 +114,7 @@ def _labels(records: Sequence[RunRecord]) -> list[str]:
     chosen = [_overrides(record.path) for record in records]
     keys = dict.fromkeys(key for words in chosen for key in words)
     distinct = {key: len({words.get(key) for words in chosen}) for key in keys}
-    # The keys that say most come first, since not all have room.
+    # The most informative keys come first, since not all have room.
     differing = sorted((key for key in keys if distinct[key] > 1), key=lambda key: -distinct[key])
     if not differing:
         return [str(record.config.get("name") or record.name) for record in records]
@@ -125,7 +125,7 @@ def _labels(records: Sequence[RunRecord]) -> list[str]:
 
 
 def _label(settings: Iterable[str]) -> str:
-    """Return as many settings as a name has room for, and the number of the others."""
+    """Return the settings that fit into a name, and the number of the others."""
     words = list(settings)
     shown = words[:1]
     for word in words[1:_MOST_WORDS]:
@@ -136,7 +136,7 @@ def _label(settings: Iterable[str]) -> str:
 
 
 def _overrides(run: Path) -> dict[str, str]:
-    """Return the overrides of a run by key, without those that say nothing of its group."""
+    """Return the overrides of a run by key, without those irrelevant to its group."""
     file = run / OVERRIDES
     words = read_yaml(file, WRITTEN) if file.is_file() else []
     pairs = [str(word).partition("=") for word in words or ()]
@@ -148,7 +148,7 @@ def _overrides(run: Path) -> dict[str, str]:
 
 
 def _default(config: Mapping[str, Any], key: str) -> str:
-    """Return the value of a key that was not overridden, of a group its name."""
+    """Return the default value of a key, for a group its option."""
     value: Any = config
     for part in key.split("."):
         value = value.get(part) if isinstance(value, Mapping) else None
@@ -167,7 +167,7 @@ _WORDS = {
     "laps_percent": ("surer", "less sure", "as sure", "of usual laps complete"),
     "held_out_completion": ("more robust", "less robust", "as robust", "of held-out completion"),
 }
-"""Words for better, worse and the same in the figures that a verdict names, and of what the amount is."""
+"""Words for better, worse and equal in the figures that a verdict names, and the unit of the amount."""
 VERDICT = tuple(_WORDS)
 _WITHOUT_LAP = {
     1: "faster: the other completes too few laps for a time",
@@ -195,9 +195,9 @@ class Comparison:
 
     @property
     def words(self) -> str:
-        """Return in words by how much they differ: ``faster by 1.00 s a lap (0.83 to 1.11, not chance)``.
+        """Return the difference in words: ``faster by 1.00 s a lap (0.83 to 1.11, not chance)``.
 
-        Where there are too few runs to tell, there is no word on chance.
+        With too few runs, chance is not mentioned.
         """
         better, worse, same, tail = _WORDS[self.figure]
         apart, lower_is_better = self.difference, FORMS[self.figure][2] < 0
@@ -221,7 +221,7 @@ class Comparison:
 
 
 def compared(groups: Sequence[RunGroup]) -> list[Comparison]:
-    """Hold each group against the first: on each track that both have, and on all of these together."""
+    """Compare each group with the first: on each common track, and on all of these together."""
     comparisons: list[Comparison] = []
     first, *others = groups
     for other in others:

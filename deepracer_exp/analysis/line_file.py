@@ -25,11 +25,11 @@ SUFFIXES = (".csv", ".npy", ".py")
 DIGITS = 4
 """Decimals that are written: 0.1 mm, as in logs of the service."""
 _OFFERED = 5
-"""Laps that a message offers."""
+"""Most laps that a message lists."""
 
 
 def recorded_line(view: "LogView", episode: int | None) -> tuple["pd.DataFrame", str]:
-    """Return the line of a complete lap, a point a control step, and which lap it is in words.
+    """Return the line of a complete lap, a point per control step, and the lap's description.
 
     The points are those that the recording logs, at the front of the car. `episode` is a number of `view.episodes`;
     None: the fastest.

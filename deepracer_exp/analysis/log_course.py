@@ -1,4 +1,4 @@
-"""The courses of a recording, found by name or recognised by where the car drove."""
+"""The courses of a recording, found by name or recognised by the car's positions."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -49,8 +49,8 @@ def find_courses(recording: Recording) -> tuple[dict[str, Track], tuple[LogProbl
     """Find the course of each name in a recording's `steps.track`, in the direction in which most rows were driven.
 
     One of our own runs has its courses in its config.yaml. Other names are looked up among the service's worlds; a
-    course without a known name, or with one that does not match where the car drove, is recognised by its length, its
-    width, its waypoint numbers and the positions of the car.
+    course without a known name, or with one that does not match the positions of the car, is recognised by its length,
+    its width, its waypoint numbers and the positions of the car.
 
     Returns:
         The courses by name, and those that were not recognised, or not for certain, with the reason.
@@ -136,19 +136,19 @@ def _recognised(logged: str, sample: pd.DataFrame) -> _Recognised | None:
         share = _misjudged(world_track(name), sample, car)
         rank = share > _MISJUDGED, round(away_m.get(name, NEAR_M), 3), name != named, share
         ranked.append((rank, _Recognised(name, share)))
-    # Of equals, which differ in their floors only, the first one will do.
+    # Worlds that differ in their floors only are equal: the first one is used.
     return min(ranked, key=lambda entry: entry[0])[1] if ranked else None
 
 
 def _misjudged(track: Track, sample: pd.DataFrame, car: CarConfig) -> float:
-    """Return the share of rows whose `all_wheels_on_track`, in time or late, is not what a course's borders say."""
+    """Return the share of rows whose `all_wheels_on_track`, in time or late, contradicts a course's borders."""
     on_road = recorded_wheels_on_road(Tracks([track]), np.zeros(1, np.intp), sample, car).all(axis=1)
     logged = sample[["all_wheels_on_track", "late_wheels"]].to_numpy(bool)
     return min(float(np.mean(on_road != column)) for column in logged.T)
 
 
 def _with_late_wheels(steps: pd.DataFrame, rows: NDArray[np.intp]) -> pd.DataFrame:
-    """Return rows of the steps with `late_wheels`: where the simulator ran on, what the next row of the episode logs.
+    """Return rows of the steps with `late_wheels`: the next row's wheels if the simulator was not paused.
 
     The service's simulator of 2019 and 2020 was not paused between control steps, and wheels are logged a step late.
     Its time stamps are those of a clock.
@@ -164,7 +164,7 @@ def _with_late_wheels(steps: pd.DataFrame, rows: NDArray[np.intp]) -> pd.DataFra
 def recorded_wheels_on_road(
     tracks: Tracks, track_index: TrackIndex, steps: pd.DataFrame, car: CarConfig
 ) -> NDArray[np.bool_]:
-    """Return which wheels of a recorded car were on the road, (n, 4), rebuilt from X, Y and yaw.
+    """Rebuild which wheels of a recorded car were on the road, (n, 4), rebuilt from X, Y and yaw.
 
     The steps have finite X, Y and yaw, (n,); `track_index` is the course of each, as `Tracks.on_road` takes it.
     """
@@ -273,7 +273,7 @@ def directed(forward: Track, backward: Track, steps: pd.DataFrame) -> Track:
 
 
 def progress_along(course: Track, steps: pd.DataFrame, episode: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return how far each row moved along a course since the row before, times the progress it gained by that, (n,).
+    """Return each row's movement along a course since the last row, times its gain of progress, (n,).
 
     It is positive where the course is driven in its own direction, and 0 in the first row of an episode (their numbers
     are `episode`, contiguous) and where the car was reset.

@@ -175,7 +175,7 @@ def trainings(view: LogView) -> str | None:
 
 
 def result_in_words(view: LogView) -> str:
-    """Return in a sentence how well the trained policy races; of a log without evaluations, its `headline`.
+    """Return a sentence on the trained policy's races; for a log without evaluations, its `headline`.
 
     Of a run of ours it is the best checkpoint on the usual and the held-out conditions. Of a log of the service it is
     the evaluation of the checkpoint to submit, or what its evaluations and races drove.
@@ -212,7 +212,7 @@ def _result_of_run(view: LogView, best: RunResult) -> str:
 
 
 def headline(view: LogView) -> str:
-    """Return in one sentence how much was driven and how well; episodes cut off by the end of the log do not count."""
+    """Return one sentence on the amount and quality of driving, without episodes cut off by the end of the log."""
     finished, steps = (
         count(int(view.episodes["ended"].sum()), "finished episode"),
         count(len(view.steps), "control step"),

@@ -34,9 +34,9 @@ DISCOUNT = Hyperparameters().discount_factor
 PREPARE = "prepare"
 """Status of the row in which an episode starts, before the first action."""
 LEAST_LAPS = 5
-"""Complete laps in the last third of the iterations below which those of the whole log show how the car drives."""
+"""Complete laps in the last third of the iterations below which those of the whole log are used instead."""
 LEAST_EPISODES = 5
-"""Episodes without which an iteration says little: SAC updates its policy after each one."""
+"""Fewest episodes of a meaningful iteration: SAC updates its policy after each one."""
 FINISHED = 0.75
 """Share of the usual number of episodes below which the job ended in the last iteration: its few starting places make
 it easier or harder than the others."""
@@ -65,8 +65,8 @@ class LogView:
     iterations: pd.DataFrame
     """Their iterations, `tables.ITERATION_COLUMNS`."""
     judged: pd.DataFrame
-    """Rows that judge a training: its iterations, or blocks of them where they have fewer than `LEAST_EPISODES`; of a
-    log without the one in which the job ended."""
+    """Rows that judge a training: its iterations, or blocks of them where they have fewer than `LEAST_EPISODES`; logs
+    of the service leave out the one in which the job ended."""
     in_blocks: bool
     """Whether several iterations are judged together."""
     evaluation_episodes: pd.DataFrame
@@ -74,7 +74,7 @@ class LogView:
     evaluation_steps: pd.DataFrame
     """Their steps, columns as of `steps`."""
     laps_timed: int
-    """Complete laps whose time a metrics file gives; that of the others is counted from the rows."""
+    """Number of complete laps whose time is from a metrics file; other times are counted from the rows."""
     problems: tuple[LogProblem, ...]
     """Problems of the recording and of its courses."""
     discount: float
@@ -82,7 +82,7 @@ class LogView:
     others: OthersOnRoad | None = None
     """The others around the cars of `steps`; None where the car was alone, or their places are not known."""
     placed: PlacedOthers | None = None
-    """Where these were in each episode."""
+    """Their placements in each episode."""
     run: RunRecording | None = None
     """The records that only a run of ours has; None for a log of the service."""
 
@@ -109,7 +109,7 @@ class LogView:
 
     @property
     def laps_only(self) -> bool:
-        """Whether the steps are those of complete laps, so that nothing is known of where others ended."""
+        """Whether the steps are those of complete laps only, so that the ends of other episodes are not known."""
         return self.run is not None and self.run.counted is not None
 
     @property
@@ -157,7 +157,7 @@ class LogView:
 
     @cached_property
     def convergence(self) -> Convergence | None:
-        """Since when the training has not grown; None where it is too short to say, or a stopping rule has decided.
+        """Where the training converged; None where it is too short to say, or a stopping rule has decided.
 
         Findings and figures quote this.
         """
@@ -208,7 +208,7 @@ class LogView:
         return self.is_driven & (thirds(self.steps["iteration"].to_numpy()) == 2)
 
     def now(self, least_laps: int = 0) -> tuple[pd.DataFrame, str]:
-        """Return the finished episodes that show how the car drives now, and which they are.
+        """Return the finished episodes that represent the present policy, and their description.
 
         They are those of the last third of the iterations, or of all if that has fewer than `least_laps` complete laps.
         """
@@ -347,7 +347,7 @@ def prepare(log: Recording | RunRecording | EvaluationRecording, track: str | No
 
 
 def _on_course(recording: Recording, here: NDArray[np.bool_]) -> Recording:
-    """Return a recording without updates and metrics of iterations that were driven on other tracks only.
+    """Return a recording without updates and metrics of iterations on other tracks only.
 
     `here` says of each row whether it is one of the training on the course. An iteration without a row belongs to the
     one before it.
@@ -371,7 +371,7 @@ def _on_course(recording: Recording, here: NDArray[np.bool_]) -> Recording:
 def _episodes(
     recording: Recording, wanted: NDArray[np.bool_], course: Track | None, discount: float
 ) -> tuple[pd.DataFrame, pd.DataFrame, int]:
-    """Return the wanted rows with derived columns, the table of their episodes, and how many laps files time."""
+    """Return the wanted rows with derived columns, the table of their episodes, and the number of timed laps."""
     rows = recording.steps if wanted.all() else recording.steps[wanted]
     streams, episodes = rows["stream"].astype("category").cat.codes.to_numpy(), rows["episode"].to_numpy()
     key = streams.astype(np.int64) * (int(episodes.max(initial=0)) + 1) + episodes

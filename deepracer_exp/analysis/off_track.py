@@ -17,15 +17,16 @@ PLACE_M = 1.5
 """Length of road that counts as one place."""
 PLACES = 3
 LEAST = 3
-"""Times the car must run off somewhere to make it a place."""
+"""Off-tracks that make a place."""
 BEFORE = 8
 """Control steps looked at before it leaves the road: half a second of the service's time."""
 STEERS_DEG = 5.0
-"""Mean steering below which the car counts as going straight on."""
+"""Mean steering below which the car counts as driving straight."""
 UNUSUAL = 2.0
-"""Turning so many standard deviations less than predicted is understeer; more, to the side it steers to, oversteer."""
+"""Turning this many standard deviations less than predicted is understeer; more, to the side it steers to,
+oversteer."""
 SLIDE_DEG = 15.0
-"""Slide of the rear axle from which on the tail comes round."""
+"""Slide of the rear axle from which the car counts as spinning."""
 
 UNDERSTEER, OVERSTEER, LATE, AWAY = "understeer", "oversteer", "late", "away"
 JUDGEMENTS: Mapping[str, str] = {
@@ -126,7 +127,7 @@ def off_track_places(steps: pd.DataFrame) -> list[OffTrackPlace]:
 
 
 def judge(steps: pd.DataFrame, rows: Rows) -> NDArray[np.str_]:
-    """Return for each time the car left the road which mistake it made before: keys of `JUDGEMENTS`.
+    """Classify the mistake before each off-track: keys of `JUDGEMENTS`.
 
     The `BEFORE` control steps up to the row count. A simulated car turns less and later than a bicycle, so its turning
     is compared with what the same steering usually does in the same recording. The yaw rate follows
@@ -150,7 +151,7 @@ def judge(steps: pd.DataFrame, rows: Rows) -> NDArray[np.str_]:
 
 
 def _stretches(steps: pd.DataFrame) -> tuple[Values, Values, Values]:
-    """Return for the `BEFORE` steps up to each row what the car did; NaN in the first rows of an episode.
+    """Summarise the `BEFORE` steps up to each row; NaN in the first rows of an episode.
 
     Returns:
         Mean steering in degrees, mean yaw rate minus the predicted one in degrees a second (positive to the left), and
@@ -186,7 +187,7 @@ def _before(values: Values, rows: int) -> Values:
 
 
 def neighbours(places: Values, others: Values, within: float) -> NDArray[np.intp]:
-    """Count for each lap position the others that are near it on the shorter way round."""
+    """Count for each lap position the others near it in the shorter direction."""
     around = np.sort(np.concatenate([others - 1.0, others, others + 1.0]))
     return np.searchsorted(around, places + within, "right") - np.searchsorted(
         around, places - within, "left"
@@ -194,16 +195,16 @@ def neighbours(places: Values, others: Values, within: float) -> NDArray[np.intp
 
 
 def _apart(a: Values | float, b: Values | float) -> Values:
-    """Return the distance of lap positions on the shorter way round."""
+    """Return the distance of lap positions in the shorter direction."""
     difference = np.abs(np.asarray(a) - np.asarray(b))
     return np.minimum(difference, 1.0 - difference)
 
 
 def risk_counts(episodes: pd.DataFrame, n: int, reach: int = 0) -> tuple[Values, Values]:
-    """Return for each of n waypoints how many episodes passed it, and how many left the road there.
+    """Return the number of episodes that passed each of n waypoints, and of those that left the road there.
 
-    An episode passes every waypoint from that of its first row to that of its last row, also those that a control
-    step jumped over; a complete lap passes all of them. So many waypoints to either side as `reach` count as well.
+    An episode passes every waypoint from that of its first row to that of its last row, also those that a control step
+    jumped over; a complete lap passes all of them. `reach` waypoints to either side count as well.
     """
     first, last = (episodes[name].to_numpy(np.int64) for name in ("start_at", "last_waypoint"))
     progress = episodes["progress"].to_numpy(np.float64)

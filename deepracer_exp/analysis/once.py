@@ -15,7 +15,7 @@ Result = TypeVar("Result")
 def once_per_view(
     find: "Callable[Concatenate[LogView, Arguments], Result]",
 ) -> "Callable[Concatenate[LogView, Arguments], Result]":
-    """Let a function of a view, and of arguments with a hash, compute each result once, and keep it with the view."""
+    """Cache the results of a function of a view, and of hashable arguments, with the view."""
     results: WeakKeyDictionary[LogView, dict[Any, Result]] = WeakKeyDictionary()
 
     @wraps(find)

@@ -1,4 +1,4 @@
-"""The others around the cars of a log: where they were, which of them was run into, and which was passed."""
+"""Boxes, bots and rivals around the cars of a log: their places, crashes into them, and passes."""
 
 from dataclasses import dataclass
 
@@ -26,9 +26,9 @@ from .step_columns import begins_of
 ORIGIN_BEHIND_M = 0.14
 """Distance from the logged point, the front of the car, back to its origin (deepracer-simapp)."""
 NEAR_M = 2.0
-"""Gap along the lap below which a car that gets past something has passed it, not jumped."""
+"""Gap along the lap up to which getting ahead of something counts as a pass, not as a jump."""
 _TOUCHED_M = 0.6
-"""Distance between the origins of a car and what it may have run into."""
+"""Distance between the origins of a car and a candidate for its crash."""
 _EPISODES = 2000
 """Episodes whose poses are rebuilt together: 100 MB with six others."""
 
@@ -122,9 +122,9 @@ def others_on_road(recorded: PlacedOthers, steps: pd.DataFrame, course: Track) -
 
 
 def placed_in_log(recording: Recording, steps: pd.DataFrame, course: Track | None) -> PlacedOthers | None:
-    """Return the others of the episodes of a log of the service, as far as the parameters of its job say where.
+    """Return the others of the episodes of a service log, as far as the parameters of its job give their places.
 
-    Bots are driven by the control steps; where one has stopped because it hit the car is not logged.
+    Bots are driven by the control steps; stops after hitting the car are not logged.
 
     Args:
         recording: with the parameters about boxes and bots.
@@ -191,7 +191,7 @@ def _met(
 def costliest(
     others: OthersOnRoad, rows: NDArray[np.bool_]
 ) -> tuple[str, dict[str, float | int | str]] | None:
-    """Return a sentence on which of the others costs most of the crashes, and its numbers; None without a crash.
+    """Return a sentence on the object with most crashes, and its numbers; None without a crash.
 
     `rows` are the rows of the steps that count.
     """

@@ -1,4 +1,4 @@
-"""An action space from driven laps: which laps count, and which few actions are nearest to their commands."""
+"""An action space from driven laps: selection of laps, and the few actions nearest to their commands."""
 
 from dataclasses import dataclass, replace
 
@@ -29,7 +29,7 @@ RESCUE_MPS = 1.3
 CORRECTION = 1 / 3
 """Share of full lock that brings a car back to its line at the laps' own speed."""
 NEAR = 0.5
-"""Distance from a chosen action, m/s or as much steering, up to which one to recover with is not added."""
+"""Distance from a chosen action, in m/s or equivalent steering, within which no action for recovery is added."""
 STEERING_STEP_DEG, SPEED_STEP_MPS = 0.5, 0.05
 """Proposed actions are rounded to multiples of these."""
 _LOWEST = 1.0
@@ -65,7 +65,7 @@ class ActionProposal:
     commands: Commands
     actions: tuple[Action, ...]
     to_recover: tuple[bool, ...]
-    """Whether each action was added to recover with."""
+    """Whether each action was added for recovery."""
     nearest: NDArray[np.intp]
     """Number of the action that is nearest to each command (n,)."""
 
@@ -146,7 +146,7 @@ def commands_of_fastest(lap: FastestLap, car: str, track: str) -> Commands:
 
 
 def check_count(wanted: int) -> None:
-    """Check how many actions are asked for.
+    """Check the wanted number of actions.
 
     Raises:
         BadInput: too few or too many.
@@ -156,7 +156,7 @@ def check_count(wanted: int) -> None:
 
 
 def propose_actions(commands: Commands, wanted: int, car: CarConfig) -> ActionProposal:
-    """Choose the actions nearest to the commands of fast laps, and what a policy needs to recover.
+    """Choose the actions nearest to the commands of fast laps, and add actions for recovery.
 
     `wanted` is a number of actions that `check_count` accepts.
 
@@ -190,7 +190,7 @@ def propose_actions(commands: Commands, wanted: int, car: CarConfig) -> ActionPr
 
 
 def _to_recover(commands: Commands, car: CarConfig) -> Values:
-    """Return the actions that a policy needs to recover, (5, 2) degrees and m/s."""
+    """Return the actions for recovery, (5, 2) degrees and m/s."""
     lowest_mps, usual_mps = np.percentile(commands.speed_mps, [_LOWEST, 50.0])
     slow_mps, lock_deg = min(lowest_mps, RESCUE_MPS), car.max_steering_deg
     turns = [(side * lock_deg, slow_mps) for side in (-1, 0, 1)]

@@ -18,7 +18,7 @@ SAMPLE_M = 0.15
 MOST = 200
 """Points of a line; the computing time grows with their cube."""
 ROUNDS = 5
-"""Each round goes half of the way to its solution, which keeps the line from oscillating; five go 97 per cent."""
+"""Each round goes half of the way to its solution, so that the line does not oscillate; five go 97 per cent."""
 WHEELBASE_M = 0.164
 """Wheelbase of every car of the service (deepracer-simapp urdf/deepracer)."""
 
@@ -88,7 +88,7 @@ def _places(course: Track) -> Values:
 
 
 def _road_across(course: Track, center: Values, sideways: Values) -> tuple[Values, Values]:
-    """Return how far the road reaches to the right (negative) and to the left of points of the centre line, m, (n,).
+    """Return the extent of the road to the right (negative) and to the left of points of the centre line, m, (n,).
 
     It is measured on the road itself: the two border points of a waypoint may lie far ahead of it or behind.
     """

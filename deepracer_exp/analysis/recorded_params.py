@@ -1,4 +1,4 @@
-"""Rebuild the params of a reward function from recorded control steps."""
+"""Rebuild a reward function's params from recorded control steps."""
 
 from collections.abc import Iterator
 from typing import Any

@@ -10,26 +10,26 @@ from deepracer_exp.stopping.rules import entropy_share
 from .statistics import chance_of_rise, moving_average
 
 LEAST_ITERATIONS = 12
-"""Iterations without which nothing is said."""
+"""Fewest iterations for a test."""
 _BLOCKS = 12
 """More iterations are averaged to so many, because neighbours are not independent."""
 RISE = 0.2
 """Rise that counts: of a list of actions as a share of the highest entropy, of a continuous space as the share by which
 the actions scatter more."""
 CHANCE = 0.02
-"""Chance of calling an entropy rising that only scatters, as the test has it."""
+"""Significance level: the chance of a false alarm for an entropy that only scatters."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RisingEntropy:
-    """Since when the entropy has risen; entropies are means of three iterations in nats."""
+    """A rise of the entropy; entropies are means of three iterations in nats."""
 
     since: int
     """The iteration at which it was lowest."""
     lowest: float
     now: float
     rise: float
-    """How much it rose, as `RISE` counts."""
+    """The rise in the terms of `RISE`."""
 
 
 def rising_entropy(iterations: pd.DataFrame, action_count: int | None) -> RisingEntropy | None:

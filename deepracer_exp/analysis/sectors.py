@@ -1,4 +1,4 @@
-"""Sectors of a course by its bends, the time that laps spend in them, and the time one lap loses to another."""
+"""Sectors of a course by its bends, the times of laps in them, and the time one lap loses to another."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ _SAMPLE_M = 0.05
 _PLACES = 200
 """Places at which two laps are compared."""
 _APART = 4.0
-"""Distance of the lap positions of two laps that are interpolated together."""
+"""Offset between the lap positions of two laps that are interpolated together."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,14 +144,14 @@ def times_by_sector(
 
 @once_per_view
 def sectors_now(view: LogView, course: Track) -> tuple[list[Sector], pd.DataFrame, str]:
-    """Return the sectors, `times_by_sector` of the laps that show how the car drives now, and which laps they are."""
+    """Return the sectors, `times_by_sector` of the present policy's laps, and the description of these."""
     episodes, when = view.now(LEAST_LAPS)
     sectors = sectors_of(course)
     return sectors, times_by_sector(view.steps, sectors, episodes.index), when
 
 
 def time_lost(steps: pd.DataFrame, lap: int, other: int) -> pd.DataFrame:
-    """Return how far one lap is behind another along the course; both are indices in `LogView.episodes`.
+    """Return one lap's delay behind another along the course; both are indices in `LogView.episodes`.
 
     Returns:
         `lap_position` and `delta_s`, the time lost since lap position 0, negative if the lap is ahead; at 1 it is the

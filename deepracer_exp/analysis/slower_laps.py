@@ -10,22 +10,22 @@ from deepracer_exp.runs.result import RELIABLE
 from .statistics import Values, chance_of_rise
 
 LEAST_TIMES = 8
-"""Lap times without which nothing is said."""
+"""Fewest lap times for a test."""
 _MOST_BLOCKS = 12
 """More lap times are averaged to so many, because those of neighbouring iterations are not independent."""
 _AVERAGED = 3
 SLOWER = 0.02
 """Share by which the last laps must be slower than the fastest of the training."""
 CHANCE = 0.02
-"""Chance of calling a training slower that only scatters, as the test has it."""
+"""Significance level: the chance of a false alarm for lap times that only scatter."""
 _RETURN_CHANCE = 0.05
 SERIES = {"eval_lap_time_s": "evaluated laps", "lap_time_mean_s": "exploring laps"}
-"""Columns of lap times, what counts more first, and what they are called."""
+"""Columns of lap times, the most important first, with their names."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SlowerLaps:
-    """Since when laps became slower."""
+    """A slowdown of laps."""
 
     laps: str
     """A value of SERIES."""
@@ -42,7 +42,7 @@ class SlowerLaps:
     return_rose: bool
 
     def __str__(self) -> str:
-        """Say so in a sentence or two."""
+        """Describe the slowdown in one or two sentences."""
         what = (
             f"The {self.laps} became slower from iteration {self.since} on, from {self.fastest_s:.2f} to "
             f"{self.now_s:.2f} s, while the return"

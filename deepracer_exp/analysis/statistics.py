@@ -1,4 +1,4 @@
-"""Statistics of what was driven: histograms, intervals, and sums by place."""
+"""Statistics of driving: histograms, intervals, and sums by place."""
 
 import math
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from deepracer_exp.compiled import njit
 
 Values = NDArray[np.float64]
 MOST_ROWS = 100_000
-"""Rows beyond which quantiles and the width of bins are those of an evenly spaced part of them."""
+"""Rows beyond which quantiles and bin widths are computed from an evenly spaced part of them."""
 
 
 def moving_average(values: Values) -> Values:
@@ -44,7 +44,7 @@ def histogram(values: Values, least: int = 8) -> Histogram:
         width = grain * max(1, round(width / grain))
         low -= grain / 2
     bins = int(np.ceil((high - low) / width + 1e-6))
-    # Of bins of one width NumPy computes the number of a value, instead of searching it.
+    # With bins of one width, NumPy computes the bin of a value instead of searching it.
     counts, edges = np.histogram(values, bins=bins, range=(low, low + width * bins))
     return Histogram((edges[1:] + edges[:-1]) / 2, counts.astype(np.float64), width)
 
@@ -157,7 +157,7 @@ def wilson(hits: ArrayLike, tries: ArrayLike) -> tuple[Values, Values]:
 
 
 def chance_of_rise(values: Values) -> float:
-    """Return the chance that values in random order rise as much with it as these do: Kendall's tau, one-sided.
+    """Return the chance that values in random order rise at least as much as these: Kendall's tau, one-sided.
 
     NaN is no value; the chance is NaN where there are no two different ones. It is exact for different values, and
     that of a normal distribution where some are equal (M. G. Kendall, Rank Correlation Methods, 1970). SciPy has this

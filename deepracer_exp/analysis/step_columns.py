@@ -1,4 +1,4 @@
-"""The steps of a recording: columns derived from them, and which rows begin an episode, a lap or a reset."""
+"""Derived columns of a recording's steps, and the first rows of episodes, laps and resets."""
 
 import math
 from collections.abc import Mapping
@@ -209,7 +209,7 @@ def _places(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _change(speed_mps, time_s, first):  # type: ignore[no-untyped-def]
-    """Return how much the speed grows and falls a second between the rows before and after, (2, n); 0 at an end.
+    """Return the rise and fall of speed per second between the rows before and after, (2, n); 0 at an end.
 
     The moment of a speed is the middle of its step. Steps are uneven, so that differences of neighbours would be mostly
     noise.
@@ -262,14 +262,14 @@ def whole_from_start(steps: pd.DataFrame) -> NDArray[np.bool_]:
 
 
 def begins_of(is_so: NDArray[np.bool_], first: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which rows are the first of those in a row that are so; an episode's `first` row follows no other."""
+    """Return the first row of each consecutive block of True; an episode's `first` row begins a new block."""
     begins = is_so.copy()
     begins[1:] &= first[1:] | ~is_so[:-1]
     return begins
 
 
 def resets(steps: pd.DataFrame) -> NDArray[np.int64]:
-    """Return for each episode how often the car was put back on its way."""
+    """Return the number of resets in each episode."""
     first = first_rows(steps)
     stopped = steps["episode_status"].isin(STOPPED).to_numpy()
     begins = begins_of(stopped, first)
@@ -283,8 +283,7 @@ def resets(steps: pd.DataFrame) -> NDArray[np.int64]:
 def laps_driven(steps: pd.DataFrame) -> NDArray[np.bool_]:
     """Return for each episode whether it is a complete lap without a reset whose beginning is recorded.
 
-    Only these show the driving line and what a lap takes: a car that is put back stands, and drives a part of the lap
-    again.
+    Only these show the driving line and lap time: a car that is put back stands, and drives a part of the lap again.
     """
     begin = np.flatnonzero(first_rows(steps))
     progress = steps["progress"].to_numpy(np.float64)

@@ -62,12 +62,12 @@ ITERATION_COLUMNS: Mapping[str, str] = {
 }
 """Names of the columns, with meaning and unit."""
 CANDIDATE_LAPS = 3
-"""Complete laps of an iteration below which its 25th percentile means nothing."""
+"""Fewest complete laps of an iteration for a meaningful 25th percentile."""
 DENSE = 0.5
 """Share of complete laps a candidate must have, over the highest share of an iteration with `CANDIDATE_LAPS`."""
 MOST_CANDIDATES = 3
 UNTRAINED = "0_"
-"""How the name of the checkpoint begins with which a training starts that is no clone."""
+"""Beginning of the name of a training's first checkpoint, unless it is a clone."""
 CANDIDATE_COLUMNS: Mapping[str, str] = {
     "iteration": "that the checkpoint drove",
     "checkpoint": "the service's name of it; empty where the log does not name it",
@@ -187,7 +187,7 @@ def iteration_table(
 
 
 def _put_together(iterations: pd.Index, ended: pd.Series, least_episodes: int) -> "pd.Series[int]":
-    """Return for each iteration the last of those that make up its row; the newest row may have fewer episodes."""
+    """Return the last iteration of each iteration's block; the newest block may have fewer episodes."""
     counts = ended.value_counts().reindex(iterations, fill_value=0)
     rows, gathered = [], 0
     for count in counts:
@@ -199,7 +199,7 @@ def _put_together(iterations: pd.Index, ended: pd.Series, least_episodes: int) -
 
 
 def _from_metrics_only(recording: Recording, episodes: pd.DataFrame) -> pd.DataFrame:
-    """Return the training episodes that are in metrics files only, without a trace."""
+    """Return the training episodes that only metrics files have."""
     rows = recording.metrics
     rows = rows[(rows["phase"] == "training") & (rows["stream"] == "training")]
     rows = rows[~rows["episode"].isin(episodes["episode"])].rename(columns={"completion": "progress"})
@@ -244,8 +244,8 @@ def candidates(recording: Recording, iterations: pd.DataFrame) -> pd.DataFrame:
     lap time.
 
     The service evaluates after an iteration the policy that has driven it, before it restores the next checkpoint
-    (deepracer-simapp, markov/rollout_worker.py). What drove the first iteration is a network that has learned nothing,
-    and no candidate, unless its name says that it is a model that was cloned.
+    (deepracer-simapp, markov/rollout_worker.py). The first iteration's network has learned nothing and is no candidate,
+    unless its name is that of a cloned model.
     """
     checkpoints = recording.checkpoints
     began = [part.first_iteration for part in recording.rounds] or [0]

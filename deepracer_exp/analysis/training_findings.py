@@ -1,6 +1,6 @@
-"""Findings on a training as a whole: whether it still learns, what it unlearns, and what to do with it.
+"""Findings on a training as a whole: convergence, overfitting, slower laps, and advice.
 
-What a log of the service is advised to do is said in the words of the console, what a run of ours in its keys.
+Advice on a log of the service uses the console's terms, advice on a run of ours its keys.
 """
 
 from collections.abc import Mapping
@@ -34,7 +34,7 @@ _RANDOM = 0.95
 """Share of the highest entropy above which a policy decides almost at random."""
 
 _ENTROPY_COST_PERCENT = 5.0
-"""What the policy must have lost, so that a rising entropy is to blame: completion scatters by less."""
+"""Loss of completion from which a rising entropy is to blame: completion scatters by less."""
 
 
 def training_findings(view: LogView, submit: Finding) -> list[Finding]:
@@ -44,7 +44,7 @@ def training_findings(view: LogView, submit: Finding) -> list[Finding]:
 
 
 def _progress(view: LogView) -> Finding:
-    """Say whether the training has converged, or what its stopping rule has decided."""
+    """Report whether the training has converged, or the decision of its stopping rule."""
     if view.decision is not None:
         return _decided(view, view.decision)
     converged = view.convergence
@@ -107,7 +107,7 @@ def _too_short(view: LogView) -> Finding:
 
 
 def _growth(view: LogView, converged: Convergence) -> str:
-    """Return what still changes in a training that has not converged."""
+    """Return the figures that still change in a training that has not converged."""
     rule = convergence_rule(view.stopping)
     if converged.completion > converged.completion_before + rule.completion_gain:
         return (
@@ -123,7 +123,7 @@ def _growth(view: LogView, converged: Convergence) -> str:
 
 
 def _pace(view: LogView, converged: Convergence) -> str:
-    """Return how far a training has come, and how long it would take to a whole lap as it learns now."""
+    """Return a training's completion, and the time to a whole lap at its present pace."""
     gained = converged.completion - converged.completion_before
     driven = int((view.judged["episodes"] > 0).sum())
     words = f"completion is {converged.completion:.0f}% after {_of(driven, view)}"
@@ -137,7 +137,7 @@ def _pace(view: LogView, converged: Convergence) -> str:
 
 
 def _cures(view: LogView) -> str:
-    """Return what helps a training that drives little of the lap."""
+    """Return remedies for a training that drives little of the lap."""
     by_entropy = _entropy_cure(view)
     reward = "`deepracer-exp validate` shows what the reward function rewards, on a lap and off the road"
     if view.run is None:
@@ -149,7 +149,7 @@ def _cures(view: LogView) -> str:
 
 
 def _entropy_cure(view: LogView) -> str:
-    """Return what helps a policy that decides almost at random, "" where it does not, or that is not known."""
+    """Return remedies for a policy that decides almost at random; "" for any other, or if that is not known."""
     entropy = view.judged["entropy"].dropna().to_numpy(np.float64)
     if not len(entropy):
         return ""
@@ -204,7 +204,7 @@ def _decided(view: LogView, decision: Mapping[str, Any]) -> Finding:
 
 def _entropy_rises(view: LogView) -> Finding | None:
     settings = view.recording.hyperparameters or {}
-    if "sac_alpha" in settings:  # it leads the entropy to a target
+    if "sac_alpha" in settings:  # it steers the entropy to a target
         return None
     rising = rising_entropy(view.judged, view.action_count)
     if rising is None:
@@ -240,7 +240,7 @@ def _now(settings: Mapping[str, Any], key: str) -> str:
 
 
 def _overfits(view: LogView) -> Finding | None:
-    """Say that evaluations complete less of the lap than before, though the training does not."""
+    """Report that evaluations complete less of the lap than before, though the training does not."""
     decision, judged = view.decision, overfitting(view.judged, view.stopping)
     if judged is None or (decision is not None and decision["rule"] == "overfitting"):  # reported already
         return None
@@ -264,7 +264,7 @@ def _overfits(view: LogView) -> Finding | None:
 
 
 def _faster_too(view: LogView) -> str:
-    """Return that the evaluated laps became faster meanwhile, "" where they did not."""
+    """Return a sentence if the evaluated laps became faster meanwhile, else ""."""
     laps_s: Values = view.judged["eval_lap_time_s"].dropna().to_numpy(np.float64)
     first_s, now_s = (
         float(laps_s[:3].mean()) if len(laps_s) else 0.0,
@@ -278,7 +278,7 @@ def _faster_too(view: LogView) -> str:
 
 
 def _surer(view: LogView, judged: Overfitting | None) -> str:
-    """Return what to do about a policy that became less sure."""
+    """Return remedies for a policy that became less reliable."""
     if view.run is None:
         return f"Take {_instead(view)}, and clone it at a lower learning rate."
     words = "Clone it with randomization=sim2real, at a tenth of the learning rate, so that it meets such conditions"
@@ -289,7 +289,7 @@ def _surer(view: LogView, judged: Overfitting | None) -> str:
 
 
 def _earlier(view: LogView, judged: Overfitting) -> str | None:
-    """Return the checkpoint of a run of ours that was sure and is still there, in words; None where there is none."""
+    """Return a reliable checkpoint that a run of ours still has, in words; None if there is none."""
     assert view.run is not None
     best, folder = view.run.best.iteration, run_folder(view)
     kept = None if folder is None else {path.name for path in kept_checkpoints(folder / CHECKPOINTS)}
@@ -321,7 +321,7 @@ def _laps_slower(view: LogView) -> Finding | None:
 
 
 def _instead(view: LogView) -> str:
-    """Return which checkpoint to take instead of the last: the one that the finding `submit` names."""
+    """Return the checkpoint to take instead of the last: the one that the finding `submit` names."""
     if view.run is not None:
         best = view.run.best
         if best.iteration is None:

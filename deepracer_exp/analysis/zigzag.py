@@ -1,4 +1,4 @@
-"""Zig-zag: how often, how far and how dearly a car steers from one side to the other where the road is straight."""
+"""Zig-zag: frequency, amplitude and cost of steering from side to side on straights."""
 
 import math
 from collections.abc import Iterable
@@ -31,13 +31,13 @@ ZIGZAG_PER_M = 1.0
 """Changes of steering a metre of straight from which on a car zig-zags: fast policies of the service's races change 0.2
 to 0.4 times, those of its first trainings 1 to 7 times."""
 ZIGZAG_DEG = 5.0
-"""Angle to either side below which it cannot be seen."""
+"""Angle to either side below which zig-zag is invisible."""
 LEAST_M = 10.0
-"""Metres of straight without which the figures say little."""
+"""Fewest metres of straight for meaningful figures."""
 CURE = "an action space with smaller angles"
 
 CONSOLE_CURE = "smaller steering angles in the action space"
-"""What helps a training of the service, in the words of its console."""
+"""Remedy for a training of the service, in the terms of its console."""
 
 Figures = tuple[float, float, float]
 """`changes_per_m`, `amplitude_deg` (NaN without a change) and `lost_s` of a `ZigZag`."""
@@ -45,7 +45,7 @@ Figures = tuple[float, float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class ZigZag:
-    """What a car's zig-zag on straights adds up to; two of them add up to that of both.
+    """Sums of a car's zig-zag on straights; two of them can be added.
 
     A straight is a sector of the course without a bend (`sectors.sectors_of`), whatever line the car takes on it;
     standing starts count like the rest of a lap. The first change of steering each time a straight is driven is not
@@ -65,7 +65,7 @@ class ZigZag:
     """See `lost_s`."""
 
     def __add__(self, other: "ZigZag") -> "ZigZag":
-        """Return that of both."""
+        """Return the sums of both."""
         return ZigZag(**{name: value + getattr(other, name) for name, value in asdict(self).items()})
 
     @property
@@ -172,7 +172,7 @@ def zigzag_in(steps: pd.DataFrame, course: Track | None, wanted: NDArray[np.bool
 
 
 def total_zigzag(parts: Iterable[ZigZag]) -> ZigZag:
-    """Return what several add up to."""
+    """Return the sum of several."""
     return sum(parts, ZigZag())
 
 
@@ -217,7 +217,7 @@ def _aside(one_pass: NDArray[np.integer], bearing_rad: Values) -> Values:
 
 @once_per_view
 def zigzag_now(view: "LogView") -> tuple[Figures | None, str]:
-    """Return how the car steers on straights as it races now, and in which driving that is seen.
+    """Return the zig-zag of the present policy, and the name of the driving it was measured in.
 
     It is the evaluation of the best checkpoint of a run of ours, or of its last one; of a log of the service all its
     evaluations and races. Where these have no steps it is the training now, in which actions are drawn: the policy that

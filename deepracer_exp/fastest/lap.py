@@ -54,7 +54,7 @@ class FastestLap:
     lap_time_s: float
     """By the service's clock, from the reset on."""
     bound_s: float
-    """No lap of this kind is faster, as far as a search over lines tells (`tracks.line_time`)."""
+    """Lower bound of the lap time, from a search over lines (`tracks.line_time`)."""
     steps: Floats
     """Control steps of the lap, the prepare step first, (n, `COLUMNS`)."""
 
@@ -64,7 +64,7 @@ class FastestLap:
 
     @cached_property
     def over_bound(self) -> float:
-        """Return by what share the lap is slower than its bound."""
+        """Return the lap's excess over its bound as a share."""
         return self.lap_time_s / self.bound_s - 1.0
 
 
@@ -83,12 +83,12 @@ def command_limits(experiment: Experiment) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Question:
-    """What a fastest lap depends on."""
+    """The parameters that a fastest lap depends on."""
 
     experiment: Experiment
     track: Track
     low: Floats
-    """Lowest [steering_deg, speed_mps] that the car can be sent, (2,)."""
+    """Lowest command [steering_deg, speed_mps], (2,)."""
     high: Floats
 
     @classmethod
@@ -212,7 +212,7 @@ def fastest_lap(question: Question, on_round: OnRound | None = None) -> FastestL
 
 
 def kept_lap(question: Question) -> FastestLap | None:
-    """Return the fastest lap if an earlier search has kept it, here or for everyone; else None.
+    """Return the fastest lap if an earlier search has stored it, in the cache or the package; else None.
 
     A file that holds no lap counts as none.
     """

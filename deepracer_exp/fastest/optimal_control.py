@@ -15,7 +15,7 @@ from deepracer_exp.sim.rollout import advance, linearise
 from deepracer_exp.tracks.segments import along, is_on_road, nearest_segment
 
 _BLUR_M = 0.005
-"""Wheels whose distances to the border differ by less count both, so that the larger one has derivatives."""
+"""Wheels whose distances to the border differ by less both count, so that their maximum has derivatives."""
 _POSE = 3
 """The first entries of a state, on which the road depends."""
 _NUDGE = 1e-5
@@ -23,7 +23,7 @@ _DAMP_SPEED, _DAMP_STEERING, _DAMP_ALONG, _DAMP_ACROSS, _DAMP_YAW = 0.01, 0.1, 0
 
 
 class Motion(NamedTuple):
-    """What moves a car."""
+    """A car and its time steps."""
 
     cars: np.ndarray
     """The record of one car, (1,)."""
@@ -33,7 +33,7 @@ class Motion(NamedTuple):
 
 
 class Aim(NamedTuple):
-    """What commands are improved towards, besides distance."""
+    """Limits and costs besides distance."""
 
     limits: np.ndarray
     """Lowest and highest speed and steering, (2, 2)."""
@@ -54,7 +54,7 @@ def origin(state, com_x_m):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _inside_m(course, x_m, y_m):  # type: ignore[no-untyped-def]
-    """Return how far a point is from the nearest border, negative off the road."""
+    """Return a point's distance from the nearest border, negative off the road."""
     nearest = np.inf
     for border in (course.inner, course.outer):
         row, fraction = nearest_segment(border, 0, x_m, y_m)
@@ -65,7 +65,7 @@ def _inside_m(course, x_m, y_m):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def clearance_m(course, wheels_m, com_x_m, state):  # type: ignore[no-untyped-def]
-    """Return how far the wheel that is farthest inside is from the nearest border, negative if none is on the road."""
+    """Return the distance of the innermost wheel from the nearest border, negative if no wheel is on the road."""
     x, y, cos, sin = origin(state, com_x_m)
     inside = np.empty(len(wheels_m))
     for wheel in range(len(wheels_m)):
@@ -95,7 +95,7 @@ def distance_m(course, front_point_m, com_x_m, closed, state):  # type: ignore[n
 
 @njit(cache=True)
 def driven_m(course, front_point_m, com_x_m, states, begin_m, closed):  # type: ignore[no-untyped-def]
-    """Return how far along the centre line the front of the car is after each state, from `begin_m` on, (n,)."""
+    """Return the progress of the car's front along the centre line after each state, from `begin_m` on, (n,)."""
     length_m = course.center.lines[0].total_m
     driven = np.empty(len(states))
     before = 0.0

@@ -1,12 +1,11 @@
 """The search for the fastest lap: planned a few seconds at a time, then improved as a whole.
 
 Commands are held for a control period and the road counts at the end of each, as in the environment. The search asks
-for the longest way in a given number of periods; where the car gets over the line with a period to spare, it goes on
+for the longest way in a given number of periods; where the car crosses the line with a period to spare, it continues
 with one period less.
 
-Improving commands leads to the best ones near by only. Each few seconds are therefore planned from several first
-guesses, of which the plan that gets farthest is driven, and a lap is searched again with the line of the best one so
-far among the guesses.
+Improving commands finds local optima only. Each few seconds are therefore planned from several first guesses, the plan
+that gets farthest is driven, and a lap is searched again with the line of the best one so far among the guesses.
 """
 
 import math
@@ -29,7 +28,7 @@ from .optimal_control import Aim, Motion, clearance_m, driven_m, improve, origin
 
 Floats = NDArray[np.float64]
 OnRound = Callable[[float, float | None], None]
-"""Gets the share of the search that is done, and the lap time so far in s, None before a lap is found."""
+"""Receives the completed share of the search and the best lap time in s, None before a lap is found."""
 
 MARGIN_M = 0.002
 """How far inside the road the car's best placed wheel is kept, for the rounding of the optimisation."""
@@ -56,11 +55,11 @@ class _Pass(NamedTuple):
 
 
 PASSES = (_Pass(10, (1.8, 2.6)), _Pass(7, (2.0, 3.0)), _Pass(8, (2.0, 3.0)))
-"""They differ so that they end in different laps."""
+"""They differ, to end in different laps."""
 
 
 class Problem(NamedTuple):
-    """What compiled code needs to know of a lap."""
+    """A lap's parameters for compiled code."""
 
     course: Geometry
     front_point_m: float
@@ -231,7 +230,7 @@ class Search:
             on_road = bool((room_m[: end + problem.closed] > 0.0).all())
             plan = _Plan(commands[:end].copy(), bool(len(over)) and on_road, on_road, float(driven[end]))
             gained = plan.score < (*best.score[:-1], best.score[-1] - _GAIN_M)
-            # Off the road there is nothing to be content with.
+            # A plan that leaves the road is never good enough.
             since = 0 if gained or not best.on_road else since + 1
             best = min(best, plan, key=lambda plan: plan.score)
             if plan.complete:  # now in fewer periods
@@ -274,7 +273,7 @@ _LAP = _Effort(rounds=80, patience=8, soft=200.0, firm=500.0)
 
 
 class _Plan(NamedTuple):
-    """Commands and where they lead to."""
+    """Commands and their states."""
 
     commands: Floats
     complete: bool
@@ -284,7 +283,7 @@ class _Plan(NamedTuple):
 
     @property
     def score(self) -> tuple[bool, bool, int, float]:
-        """Return what is smaller for a better plan."""
+        """Return a cost, smaller for a better plan."""
         return not self.complete, not self.on_road, len(self.commands), -self.driven_m
 
 

@@ -29,7 +29,7 @@ STRAIGHT_SHARE = 0.05
 TOP_SHARE = 0.99
 """Share of the highest speed from which on it counts as top speed."""
 LEAST_TAKEN = 10
-"""Actions at a waypoint below which their entropy means nothing."""
+"""Fewest actions at a waypoint for a meaningful entropy."""
 _RANGES = (
     " The action space is continuous: steering is counted in five classes (split at 0.2 and 0.6 of the largest angle) "
     "and speed in three of equal width."

@@ -1,4 +1,4 @@
-"""The line that the car drives: sectors, speed, steering, slide and zig-zag, and what it loses to the fastest lap."""
+"""The driving line: sectors, speed, steering, slide and zig-zag, and its loss to the fastest lap."""
 
 from dataclasses import dataclass
 
@@ -216,7 +216,7 @@ def speed_steering_by_waypoint(view: LogView) -> Chart | None:
 
 
 def racing_line(view: LogView) -> Chart | None:
-    """Draw how far from the racing line the car drives."""
+    """Draw the car's distance from the racing line."""
     course = view.course
     if course is None:
         return None

@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 from .style import DIVERGING, INK, PAPER, SCALE, VEIL, escaped, shortened
 
 _LONGEST_NAME = 48
-"""Letters of a name in a legend, which has no more room in half a page or on a phone."""
+"""Most letters of a name in a legend, which has no more room in half a page or on a phone."""
 
 _MANY = 500
-"""Points from which on they are drawn half transparent."""
+"""Number of points from which they are drawn half transparent."""
 
 
 class Trace(dict[str, Any]):
@@ -134,8 +134,8 @@ def colored_points(
 ) -> Trace:
     """Return points coloured by values.
 
-    `scale` is what the values are, with unit; `value_range` are those of the first and the last colour, without it
-    the percentiles 1 and 99.
+    `scale` names the values with their unit; `value_range` are those of the first and the last colour, without it the
+    percentiles 1 and 99.
     """
     low, high = value_range or color_range(values)
     marker = {"size": size, "color": _light(values), "cmin": low, "cmax": high, "colorscale": SCALE}

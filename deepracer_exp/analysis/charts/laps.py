@@ -1,4 +1,4 @@
-"""Lap times: their distribution, when they were driven, what they correlate with, and two laps side by side."""
+"""Lap times: their distribution, development and correlations, and two laps side by side."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -54,7 +54,7 @@ _STARTS = 20
 
 
 def lap_time_histogram(view: LogView) -> Chart | None:
-    """Draw the lap times of all complete laps, and how likely fast ones are."""
+    """Draw the lap times of all complete laps, and the probability of fast ones."""
     laps = view.episodes[view.episodes["lap_time_s"].notna()]
     if not len(laps):
         return None
@@ -234,7 +234,7 @@ def _loss_in_words(sectors: Sequence[Sector], delta: pd.DataFrame) -> str:
 
 
 def correlations(view: LogView) -> Chart | None:
-    """Draw lap time against everything known of a lap, with linear and quadratic fits, the closest first."""
+    """Draw lap time against other figures of a lap, with linear and quadratic fits, the closest first."""
     if view.episodes["lap_time_s"].notna().sum() < 3:
         return None
     laps = _lap_columns(view)
@@ -308,7 +308,7 @@ def _lap_columns(view: LogView) -> pd.DataFrame:
 
 
 def start_position(view: LogView) -> Chart | None:
-    """Draw how far and how fast episodes drive from each start position."""
+    """Draw completion and lap time by start position."""
     first = view.steps[["lap_position", "progress"]].iloc[np.flatnonzero(first_rows(view.steps))]
     # Starts at one position differ by where the car settles, so that a part begins half of its width earlier.
     place = (first["lap_position"] - first["progress"] / 100.0).to_numpy(np.float64) * _STARTS

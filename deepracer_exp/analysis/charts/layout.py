@@ -63,7 +63,7 @@ def draw(chart: Chart, width: float = WIDTH) -> Figure:
 
 @dataclass(frozen=True)
 class _Box:
-    """The room that a panel needs, pixels."""
+    """The space of a panel in pixels."""
 
     panel: Panel
     width: float

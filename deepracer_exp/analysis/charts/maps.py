@@ -18,11 +18,11 @@ from .figure import Annotation, Layer, Panel, Shape, Trace, colored_points, heat
 from .style import FAINT, ROAD_CENTER, ROAD_EDGE, ROAD_FILL
 
 LEAST_STEPS = 4
-"""Steps in a cell below which their mean is mostly chance."""
+"""Fewest steps of a cell for a meaningful mean."""
 _SIDES_M = (0.04, 0.05, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.75, 1.0)
 """Sides of a cell; the smallest one that keeps the number of cells within bounds is used."""
 _RIM_M = 0.4
-"""Width of the ground around the road that belongs to a grid."""
+"""Width of the ground around the road within a grid."""
 _NUMBERED = 10
 """Waypoints from one number on a map to the next."""
 _LABEL = 0.035

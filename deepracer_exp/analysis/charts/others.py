@@ -1,4 +1,4 @@
-"""Figures of races among boxes and bots: laps without a crash, at which of them the car crashes, where it overtakes."""
+"""Figures of races among boxes and bots: laps without a crash, places and objects of crashes, and overtaking."""
 
 import numpy as np
 
@@ -86,7 +86,7 @@ def crash_places(view: LogView) -> Chart | None:
 
 
 def crashes_by_object(view: LogView) -> Chart | None:
-    """Draw how often the car crashes when it comes to each box or bot: in all iterations and in the last third."""
+    """Draw the crash rate at each box or bot: in all iterations and in the last third."""
     others = view.others
     if others is None or not len(others.crashes):
         return None

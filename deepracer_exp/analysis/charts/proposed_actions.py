@@ -13,7 +13,7 @@ from .style import FAINT, GRID, INK, PAPER, SPINE
 
 _COLORS = [*matplotlib.color_sequences["tab20"][::2], *matplotlib.color_sequences["tab20"][1::2]]
 _SMALLEST, _LARGEST = 40.0, 900.0
-"""Areas of an action that no command is near to, and of one that all are, printer's points squared."""
+"""Areas of an action that is nearest to no command, and to all of them, in square points."""
 
 
 def proposed_actions_picture(title: str, proposal: ActionProposal) -> bytes:

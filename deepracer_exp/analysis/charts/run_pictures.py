@@ -179,7 +179,7 @@ def lines_figure(shown: Sequence[TrackLines]) -> Figure:
 
 
 def learning_curves(metrics: pd.DataFrame) -> Figure:
-    """Draw how a run learned: completion, return, lap times and entropy against control steps.
+    """Draw a run's learning curves: completion, return, lap times and entropy against control steps.
 
     The rows are those of metrics.jsonl; `completion` in per cent, `lap_share` a fraction; `completion/TRACK` and
     `mean_lap_time_s/TRACK` of each of several tracks.
@@ -231,7 +231,7 @@ def _curves(
     curves: Mapping[str, tuple[str, str]],
     of_tracks: Sequence[str] = (),
 ) -> None:
-    # With `y`, no space is looked for above what may stand there, which would take as long as drawing the ticks.
+    # With `y`, matplotlib does not search space for the title, which would take as long as drawing the ticks.
     axes.set_title(title, loc="left", y=1.0, fontsize=11, fontweight="bold", color=INK)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color("#cdd2d8")

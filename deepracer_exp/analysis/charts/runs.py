@@ -38,7 +38,7 @@ def run_folder(view: LogView) -> Path | None:
 
 
 def group_name(name: str) -> str:
-    """Return what the names of runs that differ only in time and seed have in common."""
+    """Return the common part of the names of runs that differ only in time and seed."""
     return _SEED.sub("", _TIME.sub("", name)) or name
 
 
@@ -46,8 +46,8 @@ def recordings_compared(named: Sequence[tuple[str | None, LogView]]) -> Chart | 
     """Draw the training of runs and logs beside each other.
 
     Args:
-        named: recordings, each with the name of the group that it was given to; None: those whose names differ only in
-            time and seed are a group, drawn as its interquartile mean with its interval.
+        named: recordings, each with the name of the group that it was given to; None: recordings whose names differ
+            only in time and seed form a group, drawn as interquartile mean with interval.
     """
     if len(named) < 2:
         return None
@@ -166,7 +166,7 @@ def _clone_chain(views: Sequence[LogView]) -> list[LogView]:
 
 
 def generalisation_matrix(driven: Sequence[tuple[str, str | None, Mapping[str, float]]]) -> Chart | None:
-    """Draw how far each policy drives on each track, as it was evaluated or raced.
+    """Draw each policy's completion on each track, as evaluated or raced.
 
     Args:
         driven: of each policy its name, the track it was trained on, and its mean completion, per cent, by track.

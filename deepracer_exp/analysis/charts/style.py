@@ -59,7 +59,7 @@ _TITLE_LETTER = 11.3
 
 
 def base_layout(title: str, width: float = WIDTH) -> dict[str, Any]:
-    """Return what the layouts of all figures have in common; the title is broken into lines that fit the width."""
+    """Return the common layout of all figures; the title is broken into lines that fit the width."""
     letters = round(width / _TITLE_LETTER)
     lines = [line for part in title.split("\n") for line in textwrap.wrap(part, letters) or [""]]
     return {
@@ -78,7 +78,7 @@ def base_layout(title: str, width: float = WIDTH) -> dict[str, Any]:
 
 
 def shortened(text: str, most: int) -> str:
-    """Return a text of at most so many letters, at least 16: what is too much is left out of its middle."""
+    """Shorten a text to a number of letters, at least 16, by leaving out its middle."""
     return text if len(text) <= most else f"{text[: most - 15]} … {text[-12:]}"
 
 

@@ -200,7 +200,7 @@ def evaluations(view: LogView) -> Chart | None:
 
 
 def stability(view: LogView) -> Chart | None:
-    """Draw how regular the control steps were and how much the results of the episodes scatter."""
+    """Draw the regularity of control steps and the scatter of episode results."""
     times_ms = 1000 * view.steps["delta_time_s"].to_numpy(np.float64)
     iteration = view.steps["iteration"].to_numpy()[times_ms > 0]
     times_ms = times_ms[times_ms > 0]
