@@ -27,7 +27,7 @@ RANDOMIZED = {
     "mass_scale": "factor on all masses",
     "motor_scale": "factor on the motors' gain and torque",
     "servo_scale": "factor on the steering servos' gain",
-    "battery_sag": "share of the commanded speed lost once the battery has sagged",
+    "battery_sag": "share of the commanded speed lost in the end",
     "action_delay_steps": "control steps by which commands are delayed",
     "steering_offset_deg": "degrees added to the steering, positive to the left",
     "steering_noise_deg": "degrees, standard deviation of the noise on the steering",
@@ -82,10 +82,10 @@ space, and `episode_return` the sum of the episode's rewards up to here."""
 PACKED = {name: place for place, name in enumerate(PACKED_COLUMNS)}
 """Column number of each packed column."""
 OTHERS_PACKED = ("own_episode", "bots_stopped")
-"""Further columns with boxes or bots: the episode's number among those of its car, and whether all bots stopped in this
-step because one had hit the car."""
+"""Columns after these among boxes and bots: the number of the episode among those of its car, and whether all bots
+stopped in this step because one had hit the car."""
 RIVAL_PACKED = ("rival_x", "rival_y", "rival_yaw")
-"""Further columns in a race against a rival: x and y of its origin in metres, and its yaw in radians."""
+"""Columns after these in a race against a rival: x and y of its origin in metres, and its yaw in radians."""
 SCHEMA = pa.schema([pa.field(name, kind, metadata={"unit": unit}) for name, kind, unit in _COLUMNS])
 
 

@@ -1,4 +1,4 @@
-"""Fresh laps of a study: policies race from places and with draws that no evaluation of the sweep had."""
+"""Fresh laps of a study: policies race from starts and with draws that no evaluation of the sweep had."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -33,7 +33,7 @@ _CONFIDENCE = 0.95
 def fresh(protocol: EvaluationConfig, trials: int, *, again: bool = False) -> EvaluationConfig:
     """Return a protocol with starting positions and random draws that no evaluation of the sweep had.
 
-    With `again` they are others than without: laps that choose among policies of which fresh laps have chosen some.
+    `again` gives a second set, for a choice among policies that the first set has selected.
     """
     starts = tuple((place + _SHIFTS[again]) / trials for place in range(trials))
     return replace(protocol, trials=trials, seed=_SEED + again, starts=starts)

@@ -37,7 +37,7 @@ from .search.objectives import objective_values
 from .trial import Interrupted
 
 _CLONE = "clone_run"
-"""Attribute of a study in Optuna: what the clone is one of and with which overrides, and its run."""
+"""Attribute of a study in Optuna: the clone's parent, overrides and run."""
 _LOCK = ".last_stage.lock"
 _LOOK_S = 0.5
 
@@ -57,18 +57,18 @@ class LastStage:
         """Do nothing yet.
 
         Args:
-            config: of the sweep; `config.config.clone` has what the clone is trained with.
+            config: of the sweep; `config.config.clone` has the overrides of the clone.
             study: all its trials have ended, and one is complete.
-            stored: whether the study holds these overrides; the user's own words otherwise.
+            stored: whether these overrides come from the study, not from the user.
             view: of the sweep.
-            claims: reads what the view shows of the trials.
+            claims: reads the trials for the view.
             check: raises `Interrupted` where the process was asked to end.
         """
         self._config, self._study, self._stored = config, study, stored
         self._view, self._claims, self._check = view, claims, check
 
     def run(self) -> LastRace:
-        """Train what is missing of the clone, and let it race; store and return the result.
+        """Train the clone as far as it is missing, and let it race; store and return the result.
 
         Two sweeps of one study take turns: the second one finds the clone that the first one has made.
 
@@ -132,7 +132,7 @@ class LastStage:
         return result.folder
 
     def _planned(self, parent: StoredRun, of: Sequence[str]) -> TrainPlan | ResumePlan | Path:
-        """Return the plan of the clone, or its run if that has ended; `of` says what it is a clone of, and how."""
+        """Return the plan of the clone, or its run if that has ended; `of` describes its parent and overrides."""
         begun = self._study.user_attrs.get(_CLONE, {})
         folder = self._config.folder / begun.get("run_dir", "")
         if begun.get("of") != of or not is_run(folder):
@@ -179,7 +179,7 @@ class LastStage:
 
 
 class _Clone(Callback):
-    """Shows how far the training of the clone is, and names the study in its summary."""
+    """Shows the progress of the clone's training, and names the study in its summary."""
 
     def __init__(self, study: str, show: Callable[[int], None]):
         self._study, self._show = study, show

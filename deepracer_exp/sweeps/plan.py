@@ -1,4 +1,4 @@
-"""What a sweep was asked, with the answers: request, study, files; nothing here imports PyTorch."""
+"""The plan of a sweep: request, study and files, resolved before PyTorch is imported."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _ACTIONS = "action_space"
 _USUAL = ("deepracer", "forward")
-"""The car and the direction that the name of a list leaves out."""
+"""The car and the direction that a list's name omits."""
 
 
 @dataclass(frozen=True)
@@ -39,13 +39,13 @@ class SweepPlan:
 
     request: SweepRequest
     overrides: Sequence[str]
-    """Overrides of the request: what the study was begun with comes before what only names it."""
+    """Overrides of the request: those that began the study, then those that only name it."""
     study: "Study | None"
     """The study that is continued; None: it is begun."""
     lap_actions: LapActions | None
-    """Lists of actions of `request` that may have to be made; None: it has none."""
+    """Action lists of `request` that may have to be made; None: it has none."""
     remarks: tuple[str, ...]
-    """A line for each thing about the action space that a racer may not have meant."""
+    """Warnings about an action space that a racer may not have meant, a line each."""
 
 
 def plan_sweep(overrides: Sequence[str], *, is_only_shown: bool = False) -> SweepPlan:
@@ -72,7 +72,7 @@ def plan_sweep(overrides: Sequence[str], *, is_only_shown: bool = False) -> Swee
 
 
 def _with_lap_actions(request: SweepRequest) -> tuple[SweepRequest, LapActions | None]:
-    """Let the lists of actions from a lap compete where a ready-made search over `action_space` is as it was.
+    """Add action lists from the fastest lap to an unchanged ready-made search over `action_space`.
 
     Raises:
         BadInput: there is no single track, or no single car.

@@ -63,7 +63,7 @@ from .trial import Interrupted, Trial
 _log = logging.getLogger("deepracer_exp")
 
 _DONE_S, _INTERRUPTED_S = 30.0, 2.0
-"""How long to wait for MLflow when a sweep is done, and when it was interrupted and can resume."""
+"""Seconds to wait for MLflow at the end of a sweep, and after an interruption."""
 
 
 def sweep(plan: SweepPlan, console: Console) -> tuple[Study, Path, int]:
@@ -107,7 +107,7 @@ def sweep(plan: SweepPlan, console: Console) -> tuple[Study, Path, int]:
             study = open_study(request, overrides, space, parent, storage, runs_dir)
             enqueue(study, settings)
         acting.remember()
-        # Only runs above the seeds of a trial cannot do without it; the id of an earlier start may be of another store.
+        # Only parent runs of a trial's seeds need it; the id of an earlier start may belong to another store.
         waits = config.seeds > 1 or RUN_ID in study.user_attrs
         study_run, study_run_id = begin_study_run(request, space, store, runs_dir, waits=waits)
         worker_config = WorkerConfig(
@@ -250,7 +250,7 @@ def _conclude(
 ) -> None:
     """Find the winner, and write best_of_sweep.json and the page; then the same with the clone, if there is one.
 
-    `stored`: whether the study holds the overrides of the clone; the user's own words otherwise.
+    `stored`: whether the clone's overrides come from the study, not from the user.
     """
     # Imported here: it takes seconds, and the workers start first.
     from .report.page import write_study_page
@@ -315,7 +315,7 @@ def _parent(request: SweepRequest, study: Study | None) -> Parent | None:
 
 
 def _evaluations(experiment: Experiment, request: SweepRequest) -> int | None:
-    """Return how often a trial is evaluated before its end, None if unknown or different between trials."""
+    """Return the number of a trial's evaluations before its end, None if unknown or different between trials."""
     if {key.partition(".")[0] for key in request.space} & {"budget", "checkpoints", "experiment"} or any(
         key == "algorithm" or key.endswith("_per_iteration") for key in request.space
     ):

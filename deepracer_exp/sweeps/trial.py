@@ -1,4 +1,4 @@
-"""Trials and their runs, as the queue stores them and as Optuna, MLflow, the page and the live view show them."""
+"""Trials and their runs, in the form that the queue stores and Optuna, MLflow, the page and the live view show."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
@@ -62,7 +62,7 @@ class Trial:
     values: list[float] | None = None
     """One value per objective; None unless the trial is complete."""
     runs: tuple[SeedRun, ...] = ()
-    """One run per seed, those that were begun."""
+    """The runs that have begun, one per seed."""
 
     @classmethod
     def of(cls, trial: FrozenTrial) -> Self:
@@ -111,7 +111,7 @@ class Trial:
         return self._mean(lambda run: run.held_out_completion)
 
     def attributes(self) -> dict[str, Any]:
-        """Return what Optuna stores of an ended trial: its runs, and what they say together."""
+        """Return the attributes of an ended trial for Optuna: its runs and their summary."""
         names = ("ending", "reason", "env_steps", "wall_clock_s", "lap_time_s", "completion")
         together = {name: getattr(self, name) for name in (*names, "held_out_completion")}
         return {"runs": runs_as_json(self.runs), **together}
@@ -122,7 +122,7 @@ class Trial:
 
 
 def as_runs(stored: Iterable[Mapping[str, Any]]) -> tuple[SeedRun, ...]:
-    """Return the runs that `runs_as_json` has made plain."""
+    """Return the runs from the plain values of `runs_as_json`."""
     return tuple(SeedRun(**run) for run in stored)
 
 

@@ -55,7 +55,7 @@ _CLOCKS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Claim:
-    """One row of the table: a trial, the worker that owns it, and what earlier owners left."""
+    """One row of the table: a trial, the worker that owns it, and the runs of earlier owners."""
 
     trial: Trial
     attempt: int
@@ -80,8 +80,8 @@ class Claim:
 class TrialClaims:
     """The claims of one study.
 
-    Each change is a single statement that names the state it expects, and its effect is read back in the same
-    transaction. So a change can be repeated when its answer was lost with the connection.
+    Each change is a single statement that names the state it expects, and is read back in the same transaction. So a
+    change can be repeated if the connection broke before its answer.
     """
 
     def __init__(self, engine: sa.Engine, study: str):
@@ -180,7 +180,7 @@ class TrialClaims:
         return len(mine)
 
     def all(self) -> list[Claim]:
-        """Return every claim ever made, by the number of the trial; what can have changed is read, and no more."""
+        """Return all claims by the number of the trial, reading only those that may have changed."""
         final = self._final
         claims = [*final, *map(_as_claim, self._rows(_of.number >= len(final)))]
         while len(final) < len(claims) and claims[len(final)].is_final_as(len(final)):

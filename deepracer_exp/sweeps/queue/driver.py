@@ -20,14 +20,14 @@ from .worker_config import WorkerConfig, is_gone
 
 _LOOK_S = 0.5
 _LEAVE_S = 6.0
-"""Time for a worker that was asked to end to write a checkpoint and to log to MLflow. What it has not done by then is
-done when its trial resumes; with all that follows, the sweep has ended within ten seconds."""
+"""Time for an ending worker to write a checkpoint and to log to MLflow. The rest is done when its trial resumes; all in
+all, the sweep ends within ten seconds."""
 _FEW = 3
 """Failed trials, without any other, after which a sweep is given up."""
 
 
 Show = Callable[[Sequence[Claim], str], None]
-"""Draws all claims; the text says what happens while no trial runs, and may be empty."""
+"""Draws all claims; the text describes the work while no trial runs, and may be empty."""
 
 
 class Driver:
@@ -46,7 +46,7 @@ class Driver:
         self._claims = TrialClaims(storage.engine, config.study)
         self._running: list[LocalWorker | RayWorker] = []
         self._all_made = False
-        """A worker has found nothing left to do."""
+        """Whether a worker has found nothing left to do."""
         self._losses = 0
         """Workers that died since a trial last ended."""
         self._ended = -1
@@ -141,11 +141,11 @@ class Driver:
         ended = [claim.trial for claim in claims if claim.has_ended]
         if any(trial.state != "FAIL" for trial in ended):
             return
-        # Failures of an earlier start do not count: their cause may be mended.
+        # Failures of an earlier start do not count: their cause may be gone.
         failed = [trial for trial in ended if trial.number not in self._ended_before]
         if len(failed) < min(_FEW, self._config.config.trials - len(self._ended_before)):
             return
-        # The same error names the file of another run in each.
+        # Equal errors differ in the file of their run.
         folder = re.escape(str(self._config.folder.resolve())) + r"/[^/\s:]+"
         reasons = collections.Counter(re.sub(folder, "RUN", trial.reason) for trial in failed)
         ((reason, count),) = reasons.most_common(1)

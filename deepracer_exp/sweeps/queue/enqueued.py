@@ -1,4 +1,4 @@
-"""Settings that are known to be good, which a study tries before its sampler draws any."""
+"""Known good settings, which a study tries before its sampler draws any."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,7 +16,7 @@ from deepracer_exp.sweeps.search.space import SearchSpace, value_at
 
 
 def known_settings(request: SweepRequest, space: SearchSpace) -> list[dict[str, Choice]]:
-    """Return the settings of `sweep.enqueue`; what one of them leaves open is drawn.
+    """Return the settings of `sweep.enqueue`; keys that one of them leaves open are drawn.
 
     Raises:
         BadInput: a run cannot be found, or a key or a value is not searched.
@@ -25,7 +25,7 @@ def known_settings(request: SweepRequest, space: SearchSpace) -> list[dict[str, 
 
 
 def enqueue(study: Study, settings: Sequence[Mapping[str, Choice]]) -> None:
-    """Let the next trials have these settings, each once however often it is asked for."""
+    """Enqueue these settings for the next trials, each only once."""
     for setting in settings:
         study.enqueue_trial(dict(setting), skip_if_exists=True)
 

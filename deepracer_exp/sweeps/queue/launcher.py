@@ -1,4 +1,4 @@
-"""Worker processes: what runs in one, and how the driver starts and ends those on this machine."""
+"""Worker processes: their program, and how the driver starts and ends them on this machine."""
 
 import logging
 import multiprocessing
@@ -27,7 +27,7 @@ class LocalLauncher:
         self.workers = workers or cores()
         self.cores = max(1, cores() // self.workers)
         """Per worker."""
-        # A fork server has imported once what all workers need; see `start_workers_early`.
+        # A fork server has imported the workers' modules once; see `start_workers_early`.
         forks = sys.platform.startswith("linux")
         self._context = (
             multiprocessing.get_context("forkserver") if forks else multiprocessing.get_context("spawn")

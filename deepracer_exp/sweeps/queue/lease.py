@@ -20,8 +20,8 @@ _RENEWALS = 12
 class Lease:
     """Keeps a claim while its trial is made: a context that renews it from a thread and checks it before each write.
 
-    A process that was suspended for longer than its lease, and whose trial was taken over meanwhile, finds out by
-    `confirm`, which precedes everything that is written.
+    A process that was suspended for longer than its lease, and whose trial was taken over meanwhile, notices that in
+    `confirm`, which precedes every write.
     """
 
     def __init__(
@@ -35,7 +35,7 @@ class Lease:
         self.claim = claim
         self._claims, self._lease_s, self._patience_s = claims, lease_s, patience_s
         self.progress: Mapping[str, Any] = {}
-        """How far the trial is; the next renewal stores it."""
+        """Progress of the trial; the next renewal stores it."""
         self._renewed_at = time.monotonic()
         self._lost = False
         self._over = threading.Event()

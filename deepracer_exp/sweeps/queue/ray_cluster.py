@@ -25,7 +25,7 @@ def connect(address: str, asked_by: str) -> None:
     reachable = os.environ.get("RAY_ADDRESS", address) if address == "auto" else address
     try:
         if reachable != "auto":
-            _knock(reachable)
+            _try_connection(reachable)
         ray.init(reachable, log_to_driver=False, logging_level="error")
     except (OSError, RuntimeError, ValueError) as error:
         reason = " ".join(str(error).split()).split(". ")[0].rstrip(".")
@@ -48,7 +48,7 @@ def node_addresses() -> list[str]:
 
 
 def room(needs: dict[str, float]) -> int:
-    """Return how many workers fit on the idle cluster if each needs these resources, `CPU` and `GPU`."""
+    """Return the number of workers that fit on the idle cluster if each needs these resources, `CPU` and `GPU`."""
     wanted = {name: amount for name, amount in needs.items() if amount > 0}
     return sum(
         int(min(node["Resources"].get(name, 0.0) / amount for name, amount in wanted.items()))
@@ -62,7 +62,7 @@ def _nodes() -> list[dict[str, Any]]:
     return [node for node in ray.nodes() if node["Alive"]]
 
 
-def _knock(address: str) -> None:
+def _try_connection(address: str) -> None:
     host, colon, port = address.removeprefix("ray://").rpartition(":")
     if not colon or not port.isdigit():
         raise ValueError("accepted: HOST:PORT")

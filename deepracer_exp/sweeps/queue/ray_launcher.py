@@ -24,7 +24,7 @@ _LOST = -9
 
 
 class RayLauncher:
-    """Starts workers where the cluster has room; methods as of `LocalLauncher`.
+    """Starts workers where the cluster has room; methods as in `LocalLauncher`.
 
     Each is a process below a `WorkerActor` that reserves the cores. It is the same as in a sweep on one machine: it
     takes signals, ends with its parent, and loses its trial when its lease runs out.
@@ -84,7 +84,7 @@ class RayLauncher:
 
 
 class RayWorker:
-    """A worker on some node, as the driver sees it; attributes and methods as of `LocalWorker`."""
+    """A worker on some node, as the driver sees it; attributes and methods as in `LocalWorker`."""
 
     def __init__(self, actor: Any, begun: Any):
         self._actor, self._begun = actor, begun

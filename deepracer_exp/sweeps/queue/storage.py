@@ -89,7 +89,7 @@ class Database:
 
     @contextmanager
     def creation_lock(self, engine: sa.Engine) -> Iterator[None]:
-        """Let one process at a time create what must exist once: the tables, the study's run in MLflow.
+        """Lock the creation of things that must exist once: the tables, the study's run in MLflow.
 
         Optuna has no lock of its own here: of processes that start together all but one fail, with "table already
         exists" or with a version stored twice. The lock ends with the process that holds it.
@@ -163,7 +163,7 @@ def open_storage(url: str | None, runs_dir: Path, patience_s: float = 0.0) -> RD
             storage = _waiting(lambda: _open(database), patience_s)
         except (DBAPIError, StorageInternalError) as error:
             raise BadInput(database.shown, _reason(error)) from None
-    # SQLite then moves what it has written last into the file itself, which may be copied alone.
+    # SQLite then moves its last writes into the file itself, which may be copied alone.
     atexit.register(storage.engine.dispose)
     return storage
 
@@ -228,7 +228,7 @@ def _open(database: Database) -> RDBStorage:
         with database.creation_lock(probe):
             if database.file is not None:
                 _write_ahead(database.file)
-            # A process that was killed here leaves some of the tables: Optuna creates those that are missing.
+            # A process that was killed here leaves some of the tables: Optuna creates the missing ones.
             return _rdb(database, create=True)
     finally:
         probe.dispose()

@@ -21,7 +21,7 @@ from .claims import TABLE
 from .storage import open_storage, resolve_database
 from .widening import complete_widening, widen
 
-if TYPE_CHECKING:  # to find a study needs nothing of what composes one
+if TYPE_CHECKING:  # finding a study needs no composition
     from deepracer_exp.config.compose import Composition
     from deepracer_exp.config.sweep import SweepRequest
     from deepracer_exp.sweeps.search.space import SearchSpace
@@ -37,7 +37,7 @@ MAY_DIFFER = (
 )
 """Keys that do not change the trials themselves."""
 _OF_LAST_START = ("trials", "clone")
-"""Settings that a study is resumed with as its last start had them: they may have been given since it was begun."""
+"""Settings that a resumed study takes from its last start, because they may have changed since it began."""
 _SAME = ("objectives", "seeds", "protocol", "parent")
 """Attributes that comparable trials share, beside space and base."""
 
@@ -184,7 +184,7 @@ def _differences(stored: dict[str, object], wanted: dict[str, object], searched:
 
     lines = [f"{key}: {stored.get(key)} -> {wanted[key]}" for key in _SAME if stored.get(key) != wanted[key]]
     before, now = (
-        [line for line in base if not _says_where(line) and key_of(line) not in searched]
+        [line for line in base if not _chooses_processes(line) and key_of(line) not in searched]
         if isinstance(base, list)
         else []
         for base in (stored.get("base"), wanted["base"])
@@ -195,8 +195,8 @@ def _differences(stored: dict[str, object], wanted: dict[str, object], searched:
     return lines
 
 
-def _says_where(override: str) -> bool:
-    """Return whether an override only says in which processes a trial's cars drive, which does not change the trial."""
+def _chooses_processes(override: str) -> bool:
+    """Return whether an override only chooses the processes of a trial's cars, which does not change the trial."""
     from deepracer_exp.config.overrides import group_of, key_of
 
     return group_of(override) == "collector" and key_of(override) != "collector.cars"

@@ -52,12 +52,12 @@ from .worker_config import RUN_ID, WorkerConfig, plan_trial
 Value = TypeVar("Value")
 
 _KEEPS = {"report": "false", "trace": "laps"}
-"""What a trial's run keeps unless its overrides say more.
+"""Defaults for the stored files of a trial's run, unless its overrides set more.
 
 Traces are two thirds of a study's disk; laps save an eighth of them where most steps are of laps, as on short tracks.
 """
 _MOST_TRIES = 3
-"""How often a run is started or resumed at the same checkpoint if its process is lost each time."""
+"""Most starts of a run at the same checkpoint if its process is lost each time."""
 _STATES = {FAILED: "FAIL", STOPPED_EARLY: "PRUNED"}
 """Optuna's state of a trial whose last run has this status; other runs are complete."""
 _SHOWN = ("iteration", "env_steps", "completion", "entropy", "eval_completion", "eval_lap_time_s")
@@ -82,14 +82,14 @@ class TrialRun(Callback):
         trial_id: int,
         projector: Projector,
     ):
-        """Load what is known of the claim's trial, which has this id in Optuna; `projector` records its runs."""
+        """Load the claim's trial, which has this id in Optuna; `projector` records its runs."""
         self._config, self._claims, self._lease = config, claims, lease
         self._study, self._storage, self._trial_id = study, storage, trial_id
         self._trial = optuna.trial.Trial(study, trial_id)
         self._number = self._trial.number
         self._runs = list(lease.claim.trial.runs)
         self._reported: set[int] = set()
-        """Evaluations that Optuna has, once one of them was looked at."""
+        """Evaluations that Optuna has, once they were read."""
         self._seed = 0
         """Index of the present run."""
         self._parent_run_id: str | None = None
@@ -97,7 +97,7 @@ class TrialRun(Callback):
         self._projector = projector
 
     def make(self) -> Trial:
-        """Make what is missing of the trial.
+        """Make the missing runs of the trial.
 
         Raises:
             TakenOver: another worker has the trial now.
@@ -137,7 +137,7 @@ class TrialRun(Callback):
         return {"study": self._config.study, "trial": self._number}
 
     def _begin(self, run_dir: Path) -> None:
-        """Record where the run lies."""
+        """Record the folder of the run."""
         self._show(0.0, {})
         tried = self._run or SeedRun(seed=self._seed)
         folder = str(run_dir.resolve())
@@ -146,12 +146,12 @@ class TrialRun(Callback):
         self._patiently(lambda: self._trial.set_user_attr("runs", runs_as_json(self._runs)))
 
     def _show(self, spent: float, row: dict[str, Any]) -> None:
-        """Set what the live view shows, after this share of the present run's budget."""
+        """Update the live view, after this share of the present run's budget."""
         share = (self._seed + min(spent, 1.0)) / self._config.config.seeds
         self._lease.progress = {**row, "params": self._trial.params, "share": share}
 
     def _pruned(self, value: float) -> PruneDecision | None:
-        """Report an evaluation to Optuna, and return what the pruners decide."""
+        """Report an evaluation to Optuna, and return the pruners' decision."""
         if len(self._config.config.objectives) > 1:
             return None  # Optuna compares trials by one number only.
         rows = _rows(Path(self._runs[0].run_dir or ""))
@@ -193,7 +193,7 @@ class TrialRun(Callback):
         return overrides
 
     def _with_own_seed(self, drawn: list[str], others: Sequence[FrozenTrial]) -> list[str]:
-        """Return what was drawn, with the next seed if another trial drew the same: it would be the same run."""
+        """Return the drawn overrides, with the next seed if another trial drew the same: it would be the same run."""
         again = sum(trial.user_attrs.get("drawn") == drawn for trial in others)
         if not again:
             return drawn
@@ -203,7 +203,7 @@ class TrialRun(Callback):
     def _made(self, overrides: Sequence[str]) -> SeedRun:
         """Make the run of the present seed, and evaluate it."""
         began = time.monotonic()
-        if self._run is not None and (lost := self._lost_again(self._run)) is not None:
+        if self._run is not None and (lost := self._count_attempt(self._run)) is not None:
             return lost
         outcome = (self._run and self._resumed(self._run)) or self._trained(overrides)
         if outcome.status == INTERRUPTED:
@@ -256,7 +256,7 @@ class TrialRun(Callback):
         if not is_run(run_dir):
             return None
         if is_held(run_dir):
-            # Its process is suspended or slow and may wake up: it keeps the folder.
+            # Its process is suspended or slow and may continue: it keeps the folder.
             run_dir = copy_run(run_dir, self._lease.claim.attempt)
             self._begin(run_dir)
         title, tags = self._title_and_tags()
@@ -269,7 +269,7 @@ class TrialRun(Callback):
             assert ending is not None
             return TrainResult(ending, 0, run_dir, summary)
 
-    def _lost_again(self, run: SeedRun) -> SeedRun | None:
+    def _count_attempt(self, run: SeedRun) -> SeedRun | None:
         """Count another attempt at a run; return it as failed if its process was lost each time so far."""
         run_dir = Path(run.run_dir or "")
         checkpoints = kept_checkpoints(run_dir / CHECKPOINTS)
@@ -329,7 +329,7 @@ class TrialRun(Callback):
         return trial_run_id or study_run_id
 
     def _track(self, ended: Trial, above: Path) -> None:
-        """Let MLflow have the trial's result, beside what its runs have logged."""
+        """Record the trial's result in MLflow, beside the logs of its runs."""
         if self._config.store is None:
             return
         if self._config.config.seeds > 1:
@@ -355,7 +355,7 @@ class TrialRun(Callback):
         """Store the present run for a later owner."""
         self._runs[self._seed :] = [run]
         claim = self._lease.claim
-        # With what was drawn: a short trial ends before the first renewal.
+        # With the drawn values: a short trial ends before the first renewal.
         progress = self._lease.progress or None
         self._lease.held(lambda: self._claims.record(claim, self._runs, progress))
 

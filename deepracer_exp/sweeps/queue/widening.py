@@ -1,7 +1,7 @@
-"""A study that is given a wider search: its trials are kept, with the values that they have in it.
+"""Widen a study's search: its trials are kept, with their values in the wider space.
 
 In one study of Optuna the choices of a key cannot change. So the study is written again, first under another name, then
-under its own. The next start of the sweep completes what a killed process has left.
+under its own. The next start of the sweep completes the work of a killed process.
 """
 
 import copy
@@ -17,7 +17,7 @@ from deepracer_exp.errors import BadInput
 
 from .claims import TrialClaims, report_results
 
-if TYPE_CHECKING:  # to find a study needs nothing of what composes one
+if TYPE_CHECKING:  # finding a study needs no composition
     from deepracer_exp.config.compose import Composition
     from deepracer_exp.sweeps.search.space import Dimension, SearchSpace
 
@@ -98,7 +98,7 @@ def widen(
 def _in_space(
     trial: FrozenTrial, space: "SearchSpace", composed: "Callable[[list[str]], Composition]"
 ) -> FrozenTrial:
-    """Return a trial as one of the wider space; what samplers have noted of it is left out."""
+    """Return a trial as one of the wider space; samplers' attributes are left out."""
     moved = copy.deepcopy(trial)
     if trial.state == TrialState.WAITING:
         return moved
@@ -106,7 +106,7 @@ def _in_space(
     added: Composition | None = None
     for axis in space.dimensions:
         if axis.key in trial.params:
-            params[axis.key] = _as_in(axis, trial.params[axis.key])
+            params[axis.key] = _in_dimension(axis, trial.params[axis.key])
         elif "overrides" in trial.user_attrs and _counts(axis, params):
             added = added or composed(list(trial.user_attrs["overrides"]))
             for value in _trained_with(axis, added):
@@ -116,7 +116,7 @@ def _in_space(
     return moved
 
 
-def _as_in(axis: "Dimension", value: Any) -> Any:
+def _in_dimension(axis: "Dimension", value: Any) -> Any:
     """Return a value of a narrower dimension; a whole number may have become one of any numbers."""
     return float(value) if isinstance(axis.distribution, optuna.distributions.FloatDistribution) else value
 

@@ -26,7 +26,7 @@ RUN_ID = "mlflow_run_id"
 
 @dataclass(frozen=True)
 class Parent:
-    """A run and its checkpoint, found when a study is begun: `best:NAME` and aliases may mean another run later."""
+    """A run and its checkpoint, resolved when a study begins: `best:NAME` and aliases may mean another run later."""
 
     run_dir: str
     checkpoint: int
@@ -66,7 +66,7 @@ class WorkerConfig:
     cores: int
     """Per worker."""
     named: Mapping[str, str] = field(default_factory=acting.named, repr=False)
-    """What the user of the sweep has named of what acts, see `acting`."""
+    """The acting values that the user of the sweep has named, see `acting`."""
     addresses: Mapping[str, str] = field(default_factory=taken_out, repr=False)
     """Addresses of servers and databases with their passwords, by the redacted form the other fields hold."""
 
@@ -84,8 +84,8 @@ def owner_name(pid: int, token: str) -> str:
 def is_gone(owner: str) -> bool:
     """Return whether a worker ran on this machine and its process no longer exists.
 
-    If two machines share a name, a living worker may be taken for gone. It then loses its trial and finds out, as a
-    worker does whose lease ran out.
+    If two machines share a name, a live worker may be taken for dead. It then loses its trial and notices that, as
+    after an expired lease.
     """
     host, pid, _ = owner.rsplit(":", 2)
     return host == socket.gethostname() and not psutil.pid_exists(int(pid))

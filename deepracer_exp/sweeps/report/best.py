@@ -39,7 +39,7 @@ class FreshLaps:
 def reranked(study: optuna.Study) -> list[FreshLaps]:
     """Return the results of the best trials on fresh laps, the best first; empty before that.
 
-    Empty again once more trials are complete: those on fresh laps may not be the best any more.
+    Empty again once more trials are complete: others may then be the best.
     """
     objectives, count = objectives_of(study), len(complete_trials(study))
     attrs = study.user_attrs
@@ -68,14 +68,14 @@ def best_trial(study: optuna.Study) -> FrozenTrial:
 
 
 def best_values(study: optuna.Study) -> list[float]:
-    """Return the values of the best trial, on fresh laps if it drove some."""
+    """Return the values of the best trial, on fresh laps if there are any."""
     trial = best_trial(study)
     on_fresh_laps = {laps.trial: laps.values for laps in reranked(study)}
     return list(on_fresh_laps.get(trial.number, trial.values))
 
 
 def best_shown(study: optuna.Study) -> str:
-    """Return the values of the best trial as text, and on which laps they were driven."""
+    """Return the values of the best trial as text, with the kind of laps."""
     best = best_trial(study)
     fresh = next((laps for laps in reranked(study) if laps.trial == best.number), None)
     has_held_out = (fresh or Trial.of(best)).held_out_completion is not None

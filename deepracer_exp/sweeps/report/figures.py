@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     import plotly.graph_objects as go
 
 FEWEST_COMPLETE = 20
-"""Complete trials below which importance is chance: the best quarter would be fewer than five trials."""
+"""Fewest complete trials for a meaningful importance: the best quarter needs five trials."""
 _BEST_SHARE = 0.25
-"""Share of the trials that importance compares with all."""
+"""Share of the trials whose parameters importance compares with all."""
 _HEIGHT = 440
 _PANEL_PX = 200
 """Least width of a panel, or of the room for an axis of parallel coordinates."""
@@ -46,7 +46,7 @@ def figures(study: optuna.Study) -> dict[str, Figure]:
 
 
 def usual_range(values: Sequence[float], minimize: bool) -> tuple[float, float]:
-    """Return the ends of an axis that shows the better trials well; far worse ones lie off it.
+    """Return the ends of an axis that resolves the better trials; far worse ones lie off it.
 
     A trial without a lap has ten times the seconds of one with laps, beside which all laps would look the same.
     """
@@ -61,7 +61,7 @@ def usual_range(values: Sequence[float], minimize: bool) -> tuple[float, float]:
 
 
 def importances(study: optuna.Study) -> dict[str, float]:
-    """Return by the searched keys how much each mattered for the first objective, shares of 1, the largest first.
+    """Return the importance of each searched key for the first objective, shares of 1, the largest first.
 
     Empty where too few trials are complete, or one key is searched.
     """

@@ -1,4 +1,4 @@
-"""Labels for people: how trials ended, with colours; short names of keys; numbers, steps and durations."""
+"""Labels for people: endings of trials with colours, short keys, numbers, steps and durations."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
@@ -38,7 +38,7 @@ _BY_STATE = {TrialState.COMPLETE: "finished", TrialState.PRUNED: "pruned", Trial
 
 
 def ending_of(trial: FrozenTrial) -> str:
-    """Return how a trial ended, a key of ENDINGS."""
+    """Return a trial's ending, a key of ENDINGS."""
     if not trial.state.is_finished():
         return "running"
     stored = Trial.of(trial).ending
@@ -52,7 +52,7 @@ def ending_words(ending: str) -> str:
 
 
 def short_keys(keys: Iterable[str]) -> dict[str, str]:
-    """Return for each dotted key its last part, or as many last parts as distinguish it from the other keys."""
+    """Return the shortest distinct ending of each dotted key: its last part, or several."""
     parts = {key: key.split(".") for key in keys}
     short: dict[str, str] = {}
     for key, words in parts.items():

@@ -1,4 +1,4 @@
-"""The last race of a study: the clone of the best trial against the best and the second best one; which to submit."""
+"""The last race of a study: the clone of the best trial and the best two trials compete to be submitted."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,15 +14,15 @@ from deepracer_exp.sweeps.search.objectives import shown, shown_or_dash
 from .best import complete_trials
 
 LAST_RACE = "last_race"
-"""Attribute of a study in Optuna: what the policies drove, and of how many complete trials the first two were."""
+"""Attribute of a study in Optuna: the results of the policies, and the number of complete trials at that time."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Racer:
-    """A policy of the last race, with what it drove there."""
+    """A policy of the last race with its results."""
 
     trial: int
-    """Number of its trial; of the clone, that of the trial it was cloned from."""
+    """Number of its trial; for the clone, of its parent."""
     is_clone: bool
     run: str
     """Name of its run's folder, beside the other runs of the study."""
@@ -42,7 +42,7 @@ class Racer:
 
     @property
     def name(self) -> str:
-        """Return what it is called: ``trial 7``, ``the clone of trial 7``."""
+        """Return the policy's name: ``trial 7``, ``the clone of trial 7``."""
         return f"the clone of trial {self.trial}" if self.is_clone else f"trial {self.trial}"
 
 
@@ -55,7 +55,7 @@ class LastRace:
     cloned_with: str
     """The overrides of the clone, as `clone_words` has them."""
     racers: tuple[Racer, ...]
-    """Those with the lowest race score first, in whatever order they are given."""
+    """The policies, the lowest race score first."""
 
     def __post_init__(self) -> None:
         """Sort the racers."""
@@ -72,7 +72,7 @@ class LastRace:
         return of_conditions(BOTH, self.has_held_out)
 
     def rule(self) -> str:
-        """Return the rule by which the first one is the one to submit."""
+        """Return the rule that chooses the policy to submit."""
         conditions = " of both conditions together" if self.has_held_out else ""
         return (
             f"the lowest {self.measure}, the seconds per complete lap{conditions}, failed laps included, on "
@@ -80,7 +80,7 @@ class LastRace:
         )
 
     def verdict(self) -> str:
-        """Return which policy to submit, and why, in one sentence."""
+        """Return a sentence with the policy to submit and the reason."""
         first, *others = self.racers
         score = shown("race_score", first.race_score_s)
         against = " and ".join(
@@ -89,7 +89,7 @@ class LastRace:
         return f"Submit {first.name}: its {self.measure} on fresh laps is {score}, against {against}."
 
     def doubt(self) -> str:
-        """Return whose results do not differ from those of the first one by more than chance, empty without any."""
+        """Name the policies whose results differ from the first by no more than chance; empty without any."""
         first, *others = self.racers
         alike = [other.name for other in others if other.interval[0] <= first.interval[1]]
         if not alike:

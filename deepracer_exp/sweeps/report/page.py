@@ -37,7 +37,7 @@ _MOST_FAILURES = 20
 _MOST_PARAMETERS = 12
 _LONGEST_REASON = 140
 _MOST_NAMED, _LEAST_SHARE = 3, 0.1
-"""Parameters of which words say that they mattered most, and the least share of the importance that they have."""
+"""Most parameters that the summary calls important, and the least share of importance of these."""
 _LONGEST_TRACEBACK = 4000
 _ORDER = (TrialState.COMPLETE, TrialState.RUNNING, TrialState.PRUNED, TrialState.FAIL, TrialState.WAITING)
 
@@ -118,7 +118,7 @@ def study_summary(study: optuna.Study) -> list[str]:
 
 
 def tried(study: optuna.Study) -> str:
-    """Return what the trials differed in, and what of it mattered most, in words."""
+    """Name the searched parameters, and the most important ones."""
     keys = short_keys(sorted({key for trial in study.get_trials(deepcopy=False) for key in trial.params}))
     if not keys:
         return ""
@@ -149,7 +149,7 @@ def _winner(study: optuna.Study, keys: dict[str, str]) -> list[tuple[str, str]]:
 
 
 def _next_steps(study: optuna.Study) -> list[tuple[str, str]]:
-    """Return commands for the winner, each with what it does."""
+    """Return commands for the winner, each with its purpose."""
     winner = f"best:{study.study_name}"
     try:
         config = read_config(best_run(study))
@@ -169,10 +169,10 @@ def _next_steps(study: optuna.Study) -> list[tuple[str, str]]:
 
 
 def export_step(study: optuna.Study) -> tuple[str, str]:
-    """Return the command that exports the run to submit, with what it writes.
+    """Return the command that exports the run to submit, with its output in words.
 
-    Features of the road are known to this simulator alone: of a policy that sees them the service takes the files with
-    which to train there, and no weights.
+    Only this simulator knows features of the road: for a policy that reads them, the export has files to train with on
+    the service, without weights.
     """
     race = last_race(study)
     assert race is not None
@@ -193,7 +193,7 @@ def _resume(study: optuna.Study) -> str:
 
 
 def _where(study: optuna.Study) -> list[str]:
-    """Return the override that says where the study's runs are, if it was given one."""
+    """Return the override with the place of the study's runs, if one was given."""
     return [word for word in study.user_attrs.get("base") or () if key_of(word) == "runs_dir"]
 
 
@@ -234,7 +234,7 @@ def _has_held_out(trials: Sequence[FrozenTrial]) -> bool:
 
 
 def _words(objectives: Sequence[str], trials: Sequence[FrozenTrial]) -> str:
-    """Return what the objectives are called."""
+    """Return the names of the objectives."""
     return ", ".join(of_conditions(MEASURES[name].words, _has_held_out(trials)) for name in objectives)
 
 

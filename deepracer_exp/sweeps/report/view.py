@@ -25,7 +25,7 @@ from .labels import duration, ending_words, parameter, short_keys
 _POINTS = 16
 """Characters of a sparkline."""
 _LEAST_MADE = 0.05
-"""Trials made in this start before their pace shows how long the others take."""
+"""Trials of this start before their pace predicts the remaining time."""
 _STATES = {"COMPLETE": "done", "PRUNED": "pruned", "FAIL": "failed"}
 
 
@@ -41,7 +41,7 @@ class SweepView:
         self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
         self._began = time.monotonic()
         self._made_before: float | None = None
-        """Trials made before this start; running ones count by the share that was made."""
+        """Trials made before this start; running ones count with their completed share."""
         self._printed: set[int] = set()
         self._completions: dict[int, collections.deque[float]] = {}
         self._evaluated: dict[int, str] = {}
@@ -59,7 +59,7 @@ class SweepView:
             self._live.stop()
 
     def show(self, claims: Sequence[Claim], stage: str = "") -> None:
-        """Draw the present state of all claims; `stage` says what happens while no trial runs."""
+        """Draw the present state of all claims; `stage` describes the work while no trial runs."""
         ended = {claim.trial.number for claim in claims if claim.has_ended}
         if self._made_before is None:
             self._made_before, self._printed = _made(claims), set(ended)
@@ -105,7 +105,7 @@ class SweepView:
         return grid
 
     def _left(self, claims: Sequence[Claim]) -> str:
-        """Return how long the rest takes at the pace of this start; less if trials end early."""
+        """Return the remaining time at the pace of this start; less if trials end early."""
         made = _made(claims)
         here = made - (self._made_before or 0.0)
         if here < _LEAST_MADE:

@@ -1,4 +1,4 @@
-"""Objectives of a study: their units, the values of a policy, and the order they put trials in."""
+"""Objectives of a study: units, values of a policy, and the order of trials."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 NONE = "\N{EN DASH}"
 """Shown where there is no value."""
 _MOST_CHANGES_PER_M = 10.0
-"""More than any policy that drives a lap: a change in every third control step at 0.5 m/s."""
+"""Above that of any policy that completes a lap: a change in every third control step at 0.5 m/s."""
 _LEAST_SHARE = 0.01  # of the lap; a trial that never moved must not divide by zero
 
 
@@ -64,7 +64,7 @@ def objectives_of(study: optuna.Study) -> tuple[str, ...]:
 
 
 def cost(objectives: Sequence[str], values: Sequence[float]) -> float:
-    """Return the number that trials are sorted by, lower is better.
+    """Return the score that trials are sorted by, lower is better.
 
     One objective: its value. Several: the race score if it is one of them; otherwise lap time over the share of the
     lap driven if that is one, too, which is close to seconds per complete lap, so that a fast car that rarely finishes
@@ -112,7 +112,7 @@ def without_lap(completion: float, trial_time_s: float) -> float:
 
 
 def counted_zigzag(changes_per_m: float | None, completion: float, has_lap: bool) -> float:
-    """Return the zig-zag that counts in a sweep: without a complete lap or a straight, more than any lap has."""
+    """Return the zig-zag for a sweep: without a complete lap or a straight, a value above that of any lap."""
     if has_lap and changes_per_m is not None:
         return changes_per_m
     return without_lap(completion, _MOST_CHANGES_PER_M)

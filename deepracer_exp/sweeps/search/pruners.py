@@ -1,4 +1,4 @@
-"""Pruners that compare a trial with others, and say why it ends early.
+"""Pruners that compare a trial with others and give the reason for its early end.
 
 The pruner `entropy` is none of them: it is the stopping rule that each trial trains with.
 """
@@ -28,14 +28,14 @@ class PruneDecision(NamedTuple):
     name: str
     """`median`, `percentile` or `hyperband`; the trial's ending."""
     reason: str
-    """One line."""
+    """The reason, one line."""
 
 
 class FirstOf(BasePruner):
-    """Several of Optuna's pruners: the first that prunes a trial decides, and says why."""
+    """Several of Optuna's pruners: the first that prunes a trial decides and gives the reason."""
 
     def __init__(self, pruners: Mapping[str, tuple[BasePruner, str]]):
-        """Combine pruners by name, each with what it keeps in words; without any, no trial is pruned."""
+        """Combine pruners by name, each with a description of the trials it keeps; without any, no trial is pruned."""
         self._pruners = pruners
 
     def decide(self, study: Study, trial: FrozenTrial) -> PruneDecision | None:
@@ -60,7 +60,7 @@ def build_pruner(config: SweepConfig, evaluations: int | None = None) -> FirstOf
 
     Args:
         config: of the sweep.
-        evaluations: the most that a trial has before its end, for hyperband's brackets. None: as many as the first
+        evaluations: most evaluations of a trial before its end, for hyperband's brackets. None: as many as the first
             complete trial had; each worker finds that out by itself, and they may differ.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Samplers by name: what chooses the parameters of the next trial."""
+"""Samplers by name: they choose the parameters of the next trial."""
 
 import copy
 import math
@@ -59,7 +59,7 @@ class _PerTrialSampler(BaseSampler):
 
     A sampler draws from its seed on. Workers share the study's seed, so each of them, and each start of a study, would
     try the same first points again. Here the draws of a trial depend on its number and not on the worker or the moment;
-    what was learned from earlier trials is in the study.
+    the results of earlier trials are in the study.
     """
 
     def __init__(self, make: Callable[[int], BaseSampler]):
@@ -107,7 +107,7 @@ class _EndlessGrid(GridSampler):
 class _LearnsFromPruned(GPSampler):
     """Learns from the last values of pruned trials, too.
 
-    Optuna's own looks at complete and running trials only: if its best guess is pruned, it guesses the same again.
+    Optuna's own sampler uses complete and running trials only: if its best guess is pruned, it guesses the same again.
     """
 
     def infer_relative_search_space(self, study: Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:

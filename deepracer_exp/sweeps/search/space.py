@@ -1,4 +1,4 @@
-"""The search space of a sweep: keys, their values, and the options of a group for which a key counts."""
+"""The search space of a sweep: keys, their values, and the options of a group in which a key exists."""
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
@@ -36,9 +36,9 @@ class Dimension:
     expression: str
     distribution: BaseDistribution
     group: str | None
-    """The key's group, if that is searched, too."""
+    """The key's group, if it is searched as well."""
     options: tuple[Choice, ...] | None
-    """Options of that group for which the key counts; None: all."""
+    """Options of that group that have the key; None: all."""
 
     def matching(self, value: Any) -> list[Choice]:
         """Return the value of this dimension that equals a plain value; an empty list if none does."""
@@ -103,7 +103,7 @@ class SearchSpace:
         return self.suggest(FixedTrial(values))
 
     def as_text(self) -> dict[str, str]:
-        """Return the expressions by key."""
+        """Return the search expressions by key."""
         return {axis.key: axis.expression for axis in self.dimensions}
 
     def difference(self, other: Mapping[str, str]) -> list[str]:
@@ -229,7 +229,7 @@ class _Trials:
         return composition.mapping
 
     def _read(self, experiment: Experiment) -> None:
-        """Refuse what a run would refuse at its start, or its evaluation."""
+        """Refuse values that a run would refuse at its start or in its evaluation."""
         load_reward_source(experiment.reward)
         build_action_space(experiment.action_space)
         if self._on_the_car:
