@@ -136,7 +136,7 @@ class Difference:
 
 
 def difference(scores: Strata, other: Strata, lower_is_better: bool) -> Difference:
-    """Return how `scores` differ from those of the `other` group; both have the same tracks in the same order.
+    """Compare `scores` with those of the `other` group; both have the same tracks in the same order.
 
     Raises:
         ValueError: a track has no score.

@@ -36,10 +36,10 @@ class Finding:
     """The numbers that were compared."""
     thresholds: Mapping[str, float | int] = field(default_factory=dict)
     cost_percent: float = 0.0
-    """Its cost in per cent of completion, of failed laps, or of the lap time; 0: it is no loss."""
+    """Cost in per cent of completion, of failed laps, or of the lap time; 0: it is no loss."""
     to_do: str = ""
-    """The finding with what to do about the training as a whole, which the first of all findings says in place of
-    `sentence`; empty: there is nothing to do about it."""
+    """The finding with advice on the training as a whole, which the first of all findings shows in place of `sentence`;
+    empty: no advice."""
 
     @property
     def figure(self) -> str:

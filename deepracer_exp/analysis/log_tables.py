@@ -116,7 +116,7 @@ def best_laps(view: LogView) -> Table:
 
 
 def problem_rows(view: LogView) -> Table:
-    """Return what could not be read, where and why."""
+    """Return the unreadable parts with their places and reasons."""
     rows = [
         (problem.file, NONE if problem.line is None else f"{problem.line:,}", problem.reason)
         for problem in view.problems[:MOST_PROBLEMS]
@@ -166,7 +166,7 @@ def facts(view: LogView) -> list[tuple[str, str]]:
 
 
 def trainings(view: LogView) -> str | None:
-    """Return which trainings a recording is made of, in words; None: of one."""
+    """Name the trainings in a recording; None if there is only one."""
     rounds = view.recording.rounds
     if not rounds:
         return None
@@ -178,7 +178,7 @@ def result_in_words(view: LogView) -> str:
     """Return a sentence on the trained policy's races; for a log without evaluations, its `headline`.
 
     Of a run of ours it is the best checkpoint on the usual and the held-out conditions. Of a log of the service it is
-    the evaluation of the checkpoint to submit, or what its evaluations and races drove.
+    the evaluation of the checkpoint to submit, or the result of its evaluations and races.
     """
     best = view.candidates
     if view.run is not None and view.run.best.evaluated:

@@ -72,7 +72,7 @@ class LogView:
     evaluation_episodes: pd.DataFrame
     """Episodes on the course of all other streams, with `stream`."""
     evaluation_steps: pd.DataFrame
-    """Their steps, columns as of `steps`."""
+    """Their steps, with the columns of `steps`."""
     laps_timed: int
     """Number of complete laps whose time is from a metrics file; other times are counted from the rows."""
     problems: tuple[LogProblem, ...]

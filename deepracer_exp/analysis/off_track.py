@@ -99,15 +99,15 @@ def off_track_places(steps: pd.DataFrame) -> list[OffTrackPlace]:
     found_places: list[OffTrackPlace] = []
     while len(found_places) < PLACES and left.any():
         center = places[neighbours(places, places[left], half).argmax()]
-        here = left & (_apart(places, center) <= half)
+        here = left & (_lap_distance(places, center) <= half)
         offs = int(here.sum())
         if offs < LEAST:
             break
-        left &= _apart(places, center) > 2 * half
+        left &= _lap_distance(places, center) > 2 * half
         judgements = Counter(judged[here].tolist())
         most, times = judgements.most_common(1)[0]
         # A car that is put back on the road passes the place again.
-        passes = max(len(np.unique(episode[_apart(position, center) <= half])), offs)
+        passes = max(len(np.unique(episode[_lap_distance(position, center) <= half])), offs)
         low, high = map(float, wilson(offs, passes))
         middle = rows[here][np.argsort((places[here] - center + 0.5) % 1.0, kind="stable")[offs // 2]]
         found_places.append(
@@ -130,11 +130,11 @@ def judge(steps: pd.DataFrame, rows: Rows) -> NDArray[np.str_]:
     """Classify the mistake before each off-track: keys of `JUDGEMENTS`.
 
     The `BEFORE` control steps up to the row count. A simulated car turns less and later than a bicycle, so its turning
-    is compared with what the same steering usually does in the same recording. The yaw rate follows
-    the commanded one, u = speed * tan(steering) / wheelbase, with a lag: r' = a r + b u + c, fitted to all steps by
-    least squares. It is predicted from the yaw rate `BEFORE` steps ago and the steering since; it is unusual if
-    it differs by more than `UNUSUAL` standard deviations (1.4826 times the median deviation) of all such predictions
-    that do not end off the road.
+    is compared with the usual effect of the same steering in the same recording. The yaw rate follows the commanded
+    one, u = speed * tan(steering) / wheelbase, with a lag: r' = a r + b u + c, fitted to all steps by least squares. It
+    is predicted from the yaw rate `BEFORE` steps ago and the steering since; it is unusual if it differs by more than
+    `UNUSUAL` standard deviations (1.4826 times the median deviation) of all such predictions that do not end off the
+    road.
     """
     steer, turned_more, slide = _stretches(steps)
     near_end = np.zeros(len(steps), bool)
@@ -165,23 +165,23 @@ def _stretches(steps: pd.DataFrame) -> tuple[Values, Values, Values]:
         for name in ("steer", "yaw_rate_dps", "track_speed_mps")
     )
     # A command acts until the next row.
-    commanded = np.degrees(_before(speed, 1) * np.tan(np.radians(_before(steer, 1))) / WHEELBASE_M)
+    commanded = np.degrees(_shifted(speed, 1) * np.tan(np.radians(_shifted(steer, 1))) / WHEELBASE_M)
     # Least squares by the normal equations: three unknowns, of millions of rows.
-    columns = np.stack([_before(rate, 1), commanded, np.ones(len(rate))]) * (since >= 2)
+    columns = np.stack([_shifted(rate, 1), commanded, np.ones(len(rate))]) * (since >= 2)
     lag, gain, trim = np.linalg.lstsq(columns @ columns.T, columns @ rate, rcond=None)[0]
-    predicted, more, mean_steer = _before(rate, BEFORE), np.zeros(len(rate)), np.zeros(len(rate))
+    predicted, more, mean_steer = _shifted(rate, BEFORE), np.zeros(len(rate)), np.zeros(len(rate))
     slide = np.abs(np.nan_to_num(steps["slide_deg"].to_numpy(np.float64)))
     largest = slide.copy()
     for back in range(BEFORE - 1, -1, -1):
-        predicted = lag * predicted + gain * _before(commanded, back) + trim
-        more += (_before(rate, back) - predicted) / BEFORE
-        mean_steer += _before(steer, back + 1) / BEFORE
-        largest = np.where(since >= back, np.maximum(largest, _before(slide, back)), largest)
+        predicted = lag * predicted + gain * _shifted(commanded, back) + trim
+        more += (_shifted(rate, back) - predicted) / BEFORE
+        mean_steer += _shifted(steer, back + 1) / BEFORE
+        largest = np.where(since >= back, np.maximum(largest, _shifted(slide, back)), largest)
     whole = since > BEFORE
     return np.where(whole, mean_steer, np.nan), np.where(whole, more, np.nan), largest
 
 
-def _before(values: Values, rows: int) -> Values:
+def _shifted(values: Values, rows: int) -> Values:
     """Return each row's value `rows` rows earlier, 0 where there is none."""
     return values if not rows else np.concatenate([np.zeros(min(rows, len(values))), values[:-rows]])
 
@@ -194,7 +194,7 @@ def neighbours(places: Values, others: Values, within: float) -> NDArray[np.intp
     )
 
 
-def _apart(a: Values | float, b: Values | float) -> Values:
+def _lap_distance(a: Values | float, b: Values | float) -> Values:
     """Return the distance of lap positions in the shorter direction."""
     difference = np.abs(np.asarray(a) - np.asarray(b))
     return np.minimum(difference, 1.0 - difference)

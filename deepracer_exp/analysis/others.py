@@ -43,7 +43,7 @@ class OthersOnRoad:
     names: tuple[str, ...]
     """`box 1`, ..., `bot 1`, ...: boxes and then bots, each in the order of the lap, and then `RIVAL`; (K,)."""
     boxes: int
-    """How many of them are boxes."""
+    """Number of boxes among them."""
     corners: NDArray[np.float64]
     """Corners of boxes whose places are the same in every episode, (boxes, 4, 2); (0, 4, 2) without such boxes."""
     lap_share: Values
@@ -98,7 +98,7 @@ def others_on_road(recorded: PlacedOthers, steps: pd.DataFrame, course: Track) -
         rows = np.concatenate([np.arange(first[place], ends[place]) for place in some])
         of_episode = np.repeat(np.arange(len(some)), [ends[place] - first[place] for place in some])
         placements = [placed[int(number[first[place]])] for place in some]
-        tables = _met(recorded, placements, steps.iloc[rows], of_episode, course)
+        tables = _crashes_and_passes(recorded, placements, steps.iloc[rows], of_episode, course)
         for table, collected in zip(tables, (crashes, passes), strict=True):
             collected.append(table.assign(row=rows[table["row"]]))
     boxes = race.boxes.count
@@ -145,7 +145,7 @@ def placed_in_log(recording: Recording, steps: pd.DataFrame, course: Track | Non
     return PlacedOthers(race=race, episodes={course.reversed: placed}, period_s=CONTROL_PERIOD_S)
 
 
-def _met(
+def _crashes_and_passes(
     recorded: PlacedOthers,
     placements: list[Placement],
     steps: pd.DataFrame,

@@ -93,7 +93,7 @@ def fast_laps(lap_time_s: ArrayLike) -> NDArray[np.bool_]:
 
 
 def fast_laps_in_words(fast: int, complete: int, fastest_s: float, where: str) -> str:
-    """Return which laps count: `fast` of `complete`, driven `where`."""
+    """Describe the laps that count: `fast` of `complete`, driven `where`."""
     return (
         f"{fast:,} of {count(complete, 'complete lap')} without a reset {where}: those at most {FAST:.0%} slower "
         f"than the fastest, {fastest_s:.2f} s"

@@ -96,7 +96,7 @@ _MOVED = (
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _moved(poses, time_s, progress, first, stopped, center_deg):  # type: ignore[no-untyped-def]
-    """Return the columns `_MOVED` of what happened since the row before, (8, n)."""
+    """Return the columns `_MOVED`, of the changes since the last row, (8, n)."""
     x, y, yaw = poses
     out = np.full((8, len(x)), np.nan)
     since, apart = np.zeros((4, len(x))), stopped.copy()
@@ -246,7 +246,7 @@ def first_rows(steps: pd.DataFrame) -> NDArray[np.bool_]:
 
 
 def flying_rows(steps: pd.DataFrame) -> NDArray[np.bool_]:
-    """Return which first rows continue the row before: laps of a race are driven without a stop."""
+    """Return whether first rows continue the last row: laps of a race are driven without a stop."""
     number = steps["steps"].to_numpy()
     stream = steps["stream"].astype("category").cat.codes.to_numpy()
     flying = first_rows(steps) & (number > FIRST_STEPS)

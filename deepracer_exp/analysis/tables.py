@@ -75,7 +75,7 @@ CANDIDATE_COLUMNS: Mapping[str, str] = {
     **{name: ITERATION_COLUMNS[name] for name in ("lap_time_p25_s", "lap_time_best_s", "lap_time_mean_s")},
     **{name: ITERATION_COLUMNS[name] for name in ("lap_share", "complete", "episodes")},
 }
-"""Names of the columns, with meaning and unit; laps, shares and times are those of what is judged."""
+"""Names of the columns, with meaning and unit; laps, shares and times are those of the judged laps."""
 _REPORTED = ("entropy", "kl", "policy_loss", "value_loss", "lr")
 
 

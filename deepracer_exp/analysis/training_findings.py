@@ -96,7 +96,7 @@ def _too_short(view: LogView) -> Finding:
     driven = view.judged[view.judged["episodes"] > 0]
     needed = iterations_needed(view.judged, view.stopping)
     sentence = (
-        f"Too short to say whether the training has converged: {_of(len(driven), view)}, and at least {needed} are "
+        f"Too short to say whether the training has converged: {_rows(len(driven), view)}, and at least {needed} are "
         "needed."
     )
     values: Numbers = {"iterations": len(driven), "needed": needed}
@@ -112,7 +112,7 @@ def _growth(view: LogView, converged: Convergence) -> str:
     if converged.completion > converged.completion_before + rule.completion_gain:
         return (
             f"completion grew from {converged.completion_before:.0f} to {converged.completion:.0f}% in the last "
-            f"{_of(converged.patience, view)}"
+            f"{_rows(converged.patience, view)}"
         )
     what = (
         "reward, complete laps or lap times still improve"
@@ -126,12 +126,12 @@ def _pace(view: LogView, converged: Convergence) -> str:
     """Return a training's completion, and the time to a whole lap at its present pace."""
     gained = converged.completion - converged.completion_before
     driven = int((view.judged["episodes"] > 0).sum())
-    words = f"completion is {converged.completion:.0f}% after {_of(driven, view)}"
+    words = f"completion is {converged.completion:.0f}% after {_rows(driven, view)}"
     if gained <= 0:
-        return f"{words} and has not grown in the last {_of(converged.patience, view)}"
+        return f"{words} and has not grown in the last {_rows(converged.patience, view)}"
     left = round((100 - converged.completion) * converged.patience / gained)
     return (
-        f"{words}, {gained:.0f} points more than {_of(converged.patience, view)} ago; at this pace a whole lap is "
+        f"{words}, {gained:.0f} points more than {_rows(converged.patience, view)} ago; at this pace a whole lap is "
         f"{left:,} more away"
     )
 
@@ -165,7 +165,7 @@ def _continue(view: LogView) -> str:
     return "Keep training." if view.run is not None else "Keep training: clone the model as it is."
 
 
-def _of(number: int, view: LogView) -> str:
+def _rows(number: int, view: LogView) -> str:
     """Return so many rows of `view.judged` in words."""
     if not view.in_blocks:
         return count(number, "iteration")
@@ -180,9 +180,9 @@ def _decided(view: LogView, decision: Mapping[str, Any]) -> Finding:
     if rule == "reliable":
         advice = "Train longer: this rule ends a training when the car is reliable, not when it is fast."
     elif rule == "overfitting":
-        sentence += _faster_too(view)
+        sentence += _faster_laps(view)
         cost = values.get("held_out_completion_before", 0.0) - values.get("held_out_completion_since", 0.0)
-        advice = _surer(view, overfitting(view.judged, view.stopping))
+        advice = _overfitting_cures(view, overfitting(view.judged, view.stopping))
     elif rule == "laps_slower":
         before_s, since_s = values.get("lap_time_s_before", 1.0), values.get("lap_time_s_since", 1.0)
         cost = 100 * (since_s / before_s - 1)
@@ -259,11 +259,13 @@ def _overfits(view: LogView) -> Finding | None:
         sentence += " while the reward of the training holds: it overfits"
         values |= judged.decision.values
         thresholds |= {"return_drop": judged.rule.return_drop, "patience": judged.rule.patience}
-    sentence += f".{_faster_too(view)}"
-    return Finding("overfits", sentence, values, thresholds, fallen, f"{sentence} {_surer(view, judged)}")
+    sentence += f".{_faster_laps(view)}"
+    return Finding(
+        "overfits", sentence, values, thresholds, fallen, f"{sentence} {_overfitting_cures(view, judged)}"
+    )
 
 
-def _faster_too(view: LogView) -> str:
+def _faster_laps(view: LogView) -> str:
     """Return a sentence if the evaluated laps became faster meanwhile, else ""."""
     laps_s: Values = view.judged["eval_lap_time_s"].dropna().to_numpy(np.float64)
     first_s, now_s = (
@@ -277,18 +279,18 @@ def _faster_too(view: LogView) -> str:
     )
 
 
-def _surer(view: LogView, judged: Overfitting | None) -> str:
+def _overfitting_cures(view: LogView, judged: Overfitting | None) -> str:
     """Return remedies for a policy that became less reliable."""
     if view.run is None:
         return f"Take {_instead(view)}, and clone it at a lower learning rate."
     words = "Clone it with randomization=sim2real, at a tenth of the learning rate, so that it meets such conditions"
     if view.run.randomized:
         words = "Clone it at a tenth of the learning rate"
-    earlier = None if judged is None else _earlier(view, judged)
+    earlier = None if judged is None else _reliable_checkpoint(view, judged)
     return f"{words}; or take {earlier}." if earlier is not None else f"{words}."
 
 
-def _earlier(view: LogView, judged: Overfitting) -> str | None:
+def _reliable_checkpoint(view: LogView, judged: Overfitting) -> str | None:
     """Return a reliable checkpoint that a run of ours still has, in words; None if there is none."""
     assert view.run is not None
     best, folder = view.run.best.iteration, run_folder(view)

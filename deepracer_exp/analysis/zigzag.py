@@ -84,9 +84,9 @@ class ZigZag:
 
         It is the time on straights times 1 - cos(a), where a is the angle between the direction of travel and its mean
         over the second around: how much longer the way is than the line through its middle, at the speed driven. It is
-        a lower bound. What steering takes from the speed is not in it, because a log does not show how fast the car
-        would have been: the simulated car loses another 0.5% of its speed at 20 degrees to either side, four control
-        steps each, which is about half as much as its detour. Neither is the caution that a swerving car needs.
+        a lower bound. The loss of speed by steering is not in it, because a log does not show how fast the car would
+        have been: the simulated car loses another 0.5% of its speed at 20 degrees to either side, four control steps
+        each, which is about half as much as its detour. Neither is the caution that a swerving car needs.
         """
         return self.detour_s / self.laps if self.laps else None
 
@@ -119,7 +119,7 @@ def zigzag_of(
     """Measure the zig-zag of recorded driving.
 
     Args:
-        course: what was driven on.
+        course: of the drive.
         x_m: position of the car (n,), with `y_m`.
         y_m: see `x_m`.
         steering_deg: as commanded (n,).
@@ -177,7 +177,7 @@ def total_zigzag(parts: Iterable[ZigZag]) -> ZigZag:
 
 
 def _changes(one_pass: NDArray[np.integer], steering_deg: Values) -> tuple[int, float]:
-    """Return how often the steering changes sides again within a pass, and the sum of half the swings in degrees."""
+    """Return the changes of steering within a pass, except the first, and the sum of half the swings in degrees."""
     side = np.where(np.abs(steering_deg) >= CENTRED_DEG, np.sign(steering_deg), 0.0)
     steers = np.flatnonzero(side)
     if not len(steers):
@@ -195,7 +195,7 @@ def _changes(one_pass: NDArray[np.integer], steering_deg: Values) -> tuple[int, 
 
 
 def _aside(one_pass: NDArray[np.integer], bearing_rad: Values) -> Values:
-    """Return by how much each direction differs from the mean over `AROUND` rows on both sides, rad.
+    """Return the difference of each direction from the mean over `AROUND` rows on both sides, rad.
 
     Near the ends of a pass there are fewer rows, as many before as after: the mean of a car in a steady bend is then
     its own direction, and nothing is aside.

@@ -1,4 +1,4 @@
-"""Archives that hold logs and models, read without being unpacked."""
+"""Archives of logs and models, read without unpacking."""
 
 import lzma
 import re
@@ -33,7 +33,7 @@ def natural(text: str) -> tuple[tuple[int, int | str], ...]:
 
 
 class _SmallHeader(tarfile.TarInfo):
-    """Refuses long names and attributes that tarfile would read into memory whatever their size."""
+    """Refuses long names and attributes, which tarfile would read into memory at any size."""
 
     def _proc_member(self, archive: tarfile.TarFile) -> Any:
         if self.type not in tarfile.REGULAR_TYPES and self.size > _HEADER_BYTES:
@@ -80,7 +80,7 @@ def open_archive(path: Path) -> Archive:
 
 
 def members_of(archive: Archive) -> Iterator[ArchiveMember]:
-    """Yield the members in the order of the archive: going back would mean reading it again."""
+    """Yield the members in the order of the archive, because going back would read it again."""
     if isinstance(archive, zipfile.ZipFile):
         yield from map(ArchiveMember.of, archive.infolist())
         return

@@ -262,6 +262,6 @@ def _keep(question: Question, lap: FastestLap) -> None:
 
 
 def _file(question: Question) -> Path | None:
-    """Return where a lap is kept; None where this account has no home."""
+    """Return the file of a lap in the cache; None where this account has no home."""
     folder = cache_home()
     return None if folder is None else folder / "fastest_laps" / f"{question.key}.json"

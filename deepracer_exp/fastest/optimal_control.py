@@ -40,7 +40,7 @@ class Aim(NamedTuple):
     multipliers: np.ndarray
     """Multiplier of the road's border at each state, (n + 1,)."""
     stiffness: float
-    """How fast the cost of a wheel beside the road grows."""
+    """Stiffness of the border: the growth of the cost of a wheel beside the road."""
     calm: np.ndarray
     """Cost of a change of speed and of steering, (2,)."""
 

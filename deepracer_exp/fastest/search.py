@@ -31,7 +31,7 @@ OnRound = Callable[[float, float | None], None]
 """Receives the completed share of the search and the best lap time in s, None before a lap is found."""
 
 MARGIN_M = 0.002
-"""How far inside the road the car's best placed wheel is kept, for the rounding of the optimisation."""
+"""Clearance of the innermost wheel from the border, against the rounding of the optimisation."""
 _WINDOW, _TRUSTED = 60, 45
 """Control periods that are planned at a time, and that are kept of a plan."""
 _LOOK_AHEAD_M, _APART_M = 0.35, 0.05
@@ -46,7 +46,7 @@ _MOST_DAMPING = 100.0
 
 
 class _Pass(NamedTuple):
-    """How a lap is searched."""
+    """Settings of the search for a lap."""
 
     driven: int
     """Control periods that are driven before the next plan."""
@@ -257,7 +257,7 @@ class Search:
 
 
 class _Effort(NamedTuple):
-    """How long commands are improved."""
+    """Limits of the improvement of commands."""
 
     rounds: int
     patience: int

@@ -117,7 +117,7 @@ def _angle(steering_deg: float) -> str:
 
 
 def action_use_by_section(view: LogView) -> Chart | None:
-    """Draw how often each action is taken in each section of the course, in the last third of the iterations."""
+    """Draw the share of each action in each section of the course, in the last third of the iterations."""
     actions = action_classes(view)
     if actions is None or view.course is None:
         return None

@@ -57,7 +57,7 @@ class Chart:
     """Slug, as in links."""
     title: str
     caption: str
-    """Two or three sentences on what to see."""
+    """Two or three sentences that explain the figure."""
     rows: Sequence[Sequence[Panel]]
     """Panels row by row."""
     share_x: bool = False

@@ -25,7 +25,7 @@ _WORST = 5
 
 
 def visits_map(view: LogView) -> Chart | None:
-    """Draw how many control steps were driven in each cell of the course."""
+    """Draw the number of control steps in each cell of the course."""
     if view.course is None or not len(view.steps):
         return None
     grid = Grid.over(view.course, 10_000)

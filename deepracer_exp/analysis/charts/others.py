@@ -169,7 +169,7 @@ def _kinds(others: OthersOnRoad) -> list[str]:
 
 
 def _numbering(others: OthersOnRoad) -> str:
-    """Return a sentence on what the numbers of boxes and bots mean, if there are any."""
+    """Return a sentence that explains the numbers of boxes and bots, if there are any."""
     numbered = [{"box": "boxes", "bot": "bots"}[kind] for kind in _kinds(others) if kind != RIVAL]
     if not numbered:
         return ""

@@ -147,7 +147,7 @@ def reward_by_waypoint(view: LogView) -> Chart | None:
 
 
 def reward_terms(view: LogView, terms: pd.DataFrame) -> Chart | None:
-    """Draw what the terms of the reward function contribute, by waypoint and over the training.
+    """Draw the contributions of the reward function's terms, by waypoint and over the training.
 
     `terms` has a column for each term, in units of the reward; its index holds labels of rows of `view.steps`.
     """
@@ -182,7 +182,7 @@ def reward_terms(view: LogView, terms: pd.DataFrame) -> Chart | None:
 
 
 def reward_distribution(view: LogView) -> Chart | None:
-    """Draw how rewards are distributed over steps and over episodes."""
+    """Draw the distributions of rewards over steps and over episodes."""
     rewards = view.driven("reward")["reward"].dropna().to_numpy(np.float64)
     episodes = view.episodes[view.episodes["ended"]]
     if not len(rewards) or not len(episodes):

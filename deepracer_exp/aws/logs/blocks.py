@@ -28,7 +28,7 @@ class Blocks:
         self.lines = 0
         """Lines before the current block."""
         self.refused: list[tuple[int | None, str]] = []
-        """Line (None: from here on) and reason of what could not be read."""
+        """Line (None: from here on) and reason of each unreadable part."""
 
     def __iter__(self) -> Iterator[bytes]:
         """Yield blocks; only the last may end without a line break."""

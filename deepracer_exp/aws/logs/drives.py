@@ -1,4 +1,4 @@
-"""The drives of a recording: their iterations, their duplicates, and the numbers of their episodes."""
+"""The drives of a recording: iterations, duplicates and episode numbers."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -109,7 +109,7 @@ def _episodes_between(log: TrainingLog, usual: int) -> int:
 
 
 def rows_also_in(log: Drives, other: Drives) -> Flags:
-    """Return for each row of a log whether the other drives contain it, perhaps with more digits.
+    """Return whether the other drives contain each row of a log, perhaps with more digits.
 
     Two races can begin at the same place and time: drives are the same only if most of their common steps are.
     """
@@ -129,7 +129,7 @@ def rows_also_in(log: Drives, other: Drives) -> Flags:
 
 
 def repeated(drives: Drives) -> Flags:
-    """Return for each row whether it is a duplicate of an earlier one."""
+    """Return whether each row duplicates an earlier one."""
     key = drives.key
     if _rises(key) or len(np.unique(key)) == len(key):
         return np.zeros(len(key), np.bool_)

@@ -1,4 +1,4 @@
-"""The files of a folder or an archive, and what their paths say about them."""
+"""The files of a folder or an archive, with the jobs that their paths name."""
 
 import bz2
 import contextlib
@@ -49,7 +49,7 @@ _MARKS = {b"\x1f\x8b": "gz", b"BZh": "bz2", b"\xfd7zXZ": "xz"}
 
 @dataclass(frozen=True)
 class LogFile:
-    """One file, wherever it is."""
+    """A file in a folder or an archive."""
 
     path: Path
     """Path for messages; a member of an archive has a path below the archive's."""
@@ -105,7 +105,7 @@ class Place:
 
 
 def named_parts(path: Path) -> tuple[str, ...]:
-    """Return the parts of an absolute path as the user names it, not of the file that a link leads to."""
+    """Return the parts of an absolute path without resolving links."""
     return Path(os.path.abspath(path)).parts  # noqa: PTH100 - `resolve` would follow links
 
 
@@ -246,7 +246,7 @@ class _Archives:
         return stream if ending is None else _OPEN[ending](stream)
 
     def close(self) -> None:
-        """Close what is open."""
+        """Close the open archive."""
         if self._archive is not None:
             self._archive.close()
 

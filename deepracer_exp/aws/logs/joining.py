@@ -1,4 +1,4 @@
-"""Joins the steps of all files of a recording: what is in a CSV and in a log, in copies or twice, counts once."""
+"""Joins the steps of all files of a recording: rows in both a CSV and a log, in copies or twice count once."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -26,7 +26,7 @@ class JoinedSteps:
     """The drives of a recording, each once.
 
     Attributes:
-        problems: what was left out, and why.
+        problems: omissions and their reasons.
         settings: hyperparameters of the training, empty where no file has them.
         logs: text logs with the files that each was in.
         drives: trainings and races with their rows.
@@ -121,7 +121,7 @@ class JoinedSteps:
             self._add_rest(file, mine.choose(left), self.roots[number])
 
     def _add_rest(self, file: LogFile, rest: Drives, root: tuple[str, ...]) -> None:
-        """Add the iterations that only the log contains: the service writes no CSV of the one that a job ends in."""
+        """Add the iterations that only the log contains: the service writes no CSV of a job's last one."""
         others = [
             part for part in self.drives if (part.place.root, part.place.kind) == (root, rest.place.kind)
         ]

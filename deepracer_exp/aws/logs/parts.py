@@ -61,7 +61,7 @@ class Parts:
     hyperparameters: list[tuple[LogFile, dict[str, Any]]] = field(default_factory=list)
     reward: list[tuple[LogFile, str]] = field(default_factory=list)
     races: dict[str, dict[str, str]] = field(default_factory=dict)
-    """By kind of job, what its parameters say of boxes and bots (`job_settings.race_values`)."""
+    """Parameters about boxes and bots by kind of job (`job_settings.race_values`)."""
     model_checkpoints: list[tuple[LogFile, dict[str, str]]] = field(default_factory=list)
     """Names of the best and the last checkpoint in the folder of a model, by the keys of `checkpoint_names`."""
     worlds: dict[str, str] = field(default_factory=dict)
@@ -90,7 +90,7 @@ class Parts:
                 rows -= steps.drop_first()
 
     def refuse(self, file: LogFile, refused: list[tuple[int | None, str]]) -> None:
-        """List what cannot be read in a file."""
+        """Add the unreadable parts of a file to the problems."""
         rest = refused[MOST_LISTED:] if len(refused) > MOST_LISTED + 1 else []
         for line, reason in refused[: len(refused) - len(rest)]:
             self.problems.append(LogProblem(str(file.path), line, reason))
@@ -244,7 +244,7 @@ def read_metrics_json(stream: IO[bytes]) -> tuple[list[dict[str, Any]], list[str
 
     Returns:
         A row an episode, with the keys `episode` (from 0), `trial`, `phase`, `reward`, `completion`, `time_s`,
-        `episode_status`, `resets`; and the reasons why other items are none.
+        `episode_status`, `resets`; and the reasons why other items are not episodes.
 
     Raises:
         ValueError: it holds no list of metrics; the message gives the reason.

@@ -49,7 +49,7 @@ Numbers = Mapping[tuple[int, int, int], int]
 
 
 def read_recording(path: Path) -> Recording:
-    """Read the recording in a file, in an archive or anywhere below a folder.
+    """Read the recording in a file, an archive or a folder at any depth.
 
     Layouts are recognised: archives of the console and of DeepRacer on AWS, model folders of
     deepracer-for-cloud with one or several workers, uploaded models, single CSVs and text logs, rolled logs.

@@ -1,4 +1,4 @@
-"""A recording of a training or a race in one schema, whichever program wrote it."""
+"""A recording of a training or a race in one schema for all programs."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -96,14 +96,14 @@ class LogProblem:
     """Counted from 1; None: the whole file."""
     reason: str
     lines: int = 1
-    """Number of lines that it stands for: beyond a limit, the unreadable lines of a file are only counted."""
+    """Number of lines in this problem: beyond a limit, the unreadable lines of a file are only counted."""
 
     def __post_init__(self) -> None:
         """Make the file's name printable."""
         object.__setattr__(self, "file", readable(self.file))
 
     def __str__(self) -> str:
-        """Return it as one line."""
+        """Return the problem as one line."""
         return f"{self.file}{'' if self.line is None else f':{self.line}'}: {self.reason}"
 
 
@@ -140,12 +140,12 @@ class Recording:
     """Name of the service's checkpoint that drove each iteration, from its text logs or, if every step before it is
     recorded, their number: `309_Step-8349`."""
     checkpoints_counted: bool = False
-    """Whether nothing but the count gives these names: the numbers of a clone continue those of its parent."""
+    """Whether these names come from counting alone: the numbers of a clone continue those of its parent."""
     model_checkpoints: Mapping[str, str] = field(default_factory=dict)
     """Names of the checkpoints in the model's folder: `best_checkpoint` by the service's own evaluations, and
     `last_checkpoint`."""
     rounds: tuple[Round, ...] = ()
     """The trainings in the order of `steps`; empty where there is only one."""
     race: Mapping[str, str] = field(default_factory=dict)
-    """What the parameters of the training, or else of a race, say of boxes and bots, by the service's keys
+    """The parameters of the training, or else of a race, about boxes and bots, by the service's keys
     (`job_settings.race_values`)."""

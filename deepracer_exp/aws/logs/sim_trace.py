@@ -37,7 +37,7 @@ LOG_LAYOUTS: Layouts = {
     19: (*COMMON, *LATER),
 }
 EARLIEST_CLOCK_S = 1e8
-"""Time stamps from which on they are unix time, not that of a simulation."""
+"""Time stamps from this value are unix time, not that of a simulation."""
 # Figures and tables have a place for every waypoint and action up to the highest.
 _WHOLE = {"episode": 2**31 - 1, "steps": 2**31 - 1, "closest_waypoint": 99_999}
 """Columns of whole numbers and their largest values."""
@@ -72,12 +72,12 @@ SCHEMA = pa.schema(
 
 
 def left_out_reason(steps: int) -> str:
-    """Return the message about steps that were left out because there are too many."""
+    """Return the message about steps beyond the limit, which are left out."""
     return f"{steps:,} steps are left out: only the last {MOST_STEPS:,} of a recording are kept"
 
 
 Refused = list[tuple[int | None, str]]
-"""Line (None: from an unknown line on) and reason of what is not a row."""
+"""Line (None: from an unknown line on) and reason of each line that is not a row."""
 
 
 class StepTables:
@@ -112,7 +112,7 @@ class StepTables:
         return dropped
 
     def give_up(self, refused: Refused) -> bool:
-        """Return whether reading ends: there are no rows, but many lines that are none; the last reason says so."""
+        """Return whether to stop reading a file with many lines but no rows; the last reason says so."""
         if self.rows + self.left_out or len(refused) < MOST_REFUSED:
             return False
         rest = f"the rest is not read: none of the first {MOST_REFUSED:,} lines is a row"
@@ -194,7 +194,7 @@ def read_rows(
 ) -> tuple[pa.Table, list[tuple[int, str]]]:
     """Read the lines of a trace.
 
-    `data` are lines of comma-separated values, without what precedes them in a log. `layouts` has the columns by the
+    `data` are lines of comma-separated values, without the text before them in a log. `layouts` has the columns by the
     number of values, `before` how many of these the line before the first had; blank lines are ignored with
     `skip_blank`, else refused.
 
@@ -274,7 +274,7 @@ def _read_alike(data: bytes, columns: Sequence[str]) -> "_Rows | None":
 
 
 class _Rows:
-    """Converts the columns of lines to values, and collects why lines are not rows."""
+    """Converts the columns of lines to values, and collects the reasons of lines that are not rows."""
 
     def __init__(self, count: int, width: int, has_lists: bool) -> None:
         self.count = count
@@ -293,12 +293,12 @@ class _Rows:
     def add(self, name: str, texts: pa.Array) -> None:
         """Add a column of texts."""
         if name in _FLAGS:
-            codes, words = _words(texts)
+            codes, words = _dictionary_encode(texts)
             flags = np.array([_FLAG_OF.get(word, -1) for word in words])[codes]
             self._refuse(name, texts, flags < 0, "True or False")
             self._columns[name] = flags > 0
         elif name == "episode_status":
-            codes, words = _words(texts)
+            codes, words = _dictionary_encode(texts)
             is_status = np.array([_STATUS.fullmatch(word) is not None for word in words])
             self._refuse(name, texts, ~is_status[codes], "a status of the service")
             self._columns[name] = pa.array(words, pa.string()).take(codes)
@@ -353,7 +353,7 @@ class _Rows:
         return pa.Table.from_arrays(arrays, schema=SCHEMA)
 
 
-def _words(texts: pa.Array) -> tuple[NDArray[np.int32], list[str]]:
+def _dictionary_encode(texts: pa.Array) -> tuple[NDArray[np.int32], list[str]]:
     """Dictionary-encode repeated strings: return the index of each, and the distinct strings."""
     encoded = texts.dictionary_encode()
     return encoded.indices.to_numpy(), [_text(word) for word in encoded.dictionary.to_pylist()]
@@ -381,7 +381,7 @@ def _text(raw: bytes) -> str:
 
 
 def write_trace(steps: pd.DataFrame, file: Path) -> None:
-    """Write steps, with the columns of a trace of ours, as a CSV of the service of 2022, and its folder."""
+    """Write steps with our trace's columns as a CSV of the service of 2022; create its folder."""
     table = steps[list(LOG_LAYOUTS[17])].astype({"steps": np.float64})
     if steps["action"].isna().any():  # of a continuous action space, as the service has it
         commands = zip(steps["steer"].tolist(), steps["throttle"].tolist(), strict=True)

@@ -85,7 +85,7 @@ class TrainingLog:
     saved: list[str] = field(default_factory=list)
     """Names of the checkpoints that a trainer wrote; the first one drives the first episodes."""
     refused: list[tuple[int | None, str]] = field(default_factory=list)
-    """Line (None: from an unknown line on) and reason of what cannot be read."""
+    """Line (None: from an unknown line on) and reason of each unreadable part."""
 
     @property
     def recognised(self) -> bool:
@@ -152,7 +152,7 @@ def _parts(
 
 
 def _read_checkpoints(log: TrainingLog, block: bytes) -> None:
-    """Record from which episode on each checkpoint drives."""
+    """Record the first episode of each checkpoint."""
     marks = sorted(
         [(match.start(), match[1].decode()) for match in _RESTORED.finditer(block)]
         + ([(0, "")] if log.checkpoints and log.checkpoints[-1][0] is None else [])

@@ -59,7 +59,7 @@ _EMPTY_GRAPH = field(2, field(4, field(1, 27)))
 
 
 class StoredModel(NamedTuple):
-    """The weights of a model, and what lies beside them."""
+    """The weights of a model with the files beside them."""
 
     tensors: Tensors
     source: str
@@ -170,7 +170,7 @@ def _nearest(names: Mapping[str, int], wanted: str) -> str | None:
 
 
 def _choose(files: _Files, weights: list[str], checkpoint: str) -> tuple[str, str]:
-    """Return the file with the weights, and a note if it is not the one asked for."""
+    """Return the file with the weights, and a note if it differs from the requested one."""
     folders = {str(PurePosixPath(name).parent) for name in weights}
     if len(folders) > 1:
         raise BadInput(

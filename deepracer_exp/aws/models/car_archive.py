@@ -1,8 +1,7 @@
-"""A policy as the archive that the software of a physical car loads: model_metadata.json and a frozen graph.
+"""A policy as the archive for a physical car: model_metadata.json and a frozen graph.
 
-Source of what the car reads, refuses and misreads: deepracer-custom-car 2.1.9.9, which in these points is AWS's own
-(model_loader_node.py, model_optimizer_node.py, deepracer_navigation_node.py, sensor_fusion_node.cpp, and models.py of
-its web server).
+Source of the car's behaviour: deepracer-custom-car 2.1.9.9, which in these points is AWS's own (model_loader_node.py,
+model_optimizer_node.py, deepracer_navigation_node.py, sensor_fusion_node.cpp, and models.py of its web server).
 """
 
 import gzip
@@ -27,7 +26,7 @@ Tensors = Mapping[str, NDArray[np.float32]]
 
 
 def tar_gz(files: Mapping[str, bytes]) -> bytes:
-    """Return a .tar.gz with nothing in it that differs between two exports."""
+    """Return a reproducible .tar.gz."""
     out = io.BytesIO()
     with (
         # Weights hardly compress, at any level.
@@ -60,7 +59,7 @@ def check_weights(graph: bytes, tensors: Tensors) -> None:
 
 
 def sensor_notes(sensors: tuple[str, ...]) -> list[str]:
-    """Return a line on each thing that the car does differently with these sensors."""
+    """Return a line on each deviation of the car with these sensors."""
     notes = []
     if "STEREO_CAMERAS" in sensors:
         notes.append(
@@ -81,7 +80,7 @@ def sensor_notes(sensors: tuple[str, ...]) -> list[str]:
 
 
 def describe_commands(metadata: ModelMetadata) -> list[str]:
-    """Return a line on what the car makes of each action; for a continuous space, of its ends and middle."""
+    """Return a line with the car's response to each action; for a continuous space, to its ends and middle."""
     scale = full_scale(metadata)
     if metadata.low is not None and metadata.high is not None:
         ends = np.array([metadata.low, metadata.high])

@@ -1,7 +1,7 @@
-"""What the physical car makes of a model's actions.
+"""The physical car's conversion of a model's actions to controls.
 
 Sources: deepracer-custom-car 2.1.9.9 (as AWS's own software does), deepracer_navigation_pkg for the scales,
-servo_pkg/src/servo_mgr.cpp for what is refused.
+servo_pkg/src/servo_mgr.cpp for the limits.
 """
 
 import numpy as np
@@ -54,5 +54,5 @@ def throttle(speed_mps: ArrayLike, full_throttle_mps: float) -> Floats:
 
 
 def servo_value(requested: Floats, last: Floats) -> Floats:
-    """Return the servo's position after a request: the servo node refuses what is not in -1..1 and keeps the last."""
+    """Return the servo's position after a request: the servo node refuses values outside -1..1 and keeps the last."""
     return np.where(np.abs(requested) <= 1.0, requested, last)

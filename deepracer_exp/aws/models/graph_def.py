@@ -1,4 +1,4 @@
-"""Frozen graphs of TensorFlow 1 (`.pb`), the form in which a car takes a policy; written and read without TensorFlow.
+"""Frozen graphs of TensorFlow 1 (`.pb`), a car's format for policies; written and read without TensorFlow.
 
 Such a file is one GraphDef in the wire format of protobuf. Its weights are nodes `Const`. Source of the field numbers:
 tensorflow/core/framework/{graph,node_def,attr_value,tensor,tensor_shape,versions}.proto. Nodes have the names that they

@@ -87,8 +87,8 @@ def read_hyperparameters(
     Missing keys get the service's defaults, numbers may be written as strings, unknown keys are ignored.
 
     Raises:
-        BadInput: the file cannot be read or has values the service's trainer does not accept; one line with
-            file, key, value and what would be accepted.
+        BadInput: the file cannot be read or has values the service's trainer does not accept; one line with file, key,
+            value and accepted values.
 
     Source of the rules: deepracer-simapp, markov/sagemaker_graph_manager.py.
     """

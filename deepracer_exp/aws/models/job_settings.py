@@ -1,4 +1,4 @@
-"""run.env and training_params.yaml: where, from which starts and against whom the service trains."""
+"""run.env and training_params.yaml: track, starts and opponents of a training on the service."""
 
 import re
 from collections.abc import Mapping
@@ -67,7 +67,7 @@ class JobSettings:
     """The file's own keys, in its order."""
     world: str | None
     is_clockwise: bool | None
-    """Which of the two worlds is meant that are sampled for one direction each (deepracer-on-aws)."""
+    """Direction whose world is used, where a track has one for each direction (deepracer-on-aws)."""
     race_type: str
     reverse: bool | None
     alternate: bool | None

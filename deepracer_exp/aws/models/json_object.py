@@ -18,8 +18,8 @@ class JsonObject:
 
         Args:
             path: the file.
-            kind: what it should be, e.g. ``a model_metadata.json``.
-            accepted: what its JSON should hold, e.g. ``a JSON object with action_space``.
+            kind: the kind of file, e.g. ``a model_metadata.json``.
+            accepted: the accepted content, e.g. ``a JSON object with action_space``.
             raw: the file's content if known, e.g. of a member of an archive or a part of a log.
 
         Raises:

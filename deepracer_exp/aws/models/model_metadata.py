@@ -81,8 +81,8 @@ def read_model_metadata(path: str | Path, raw: bytes | None = None) -> ModelMeta
     Missing keys get the service's defaults, numbers may be written as strings, unknown keys are ignored.
 
     Raises:
-        BadInput: the file cannot be read or holds something the service would not accept; one line with
-            file, key, value and what would be accepted.
+        BadInput: the file cannot be read or holds something the service would not accept; one line with file, key,
+            value and accepted values.
 
     Source of the rules: deepracer-simapp, markov/boto/s3/files/model_metadata.py.
     """

@@ -100,7 +100,7 @@ def checked_rows(rows: np.ndarray) -> np.ndarray:
 
 
 def is_first_of_equals(points: np.ndarray) -> np.ndarray:
-    """Return for points (n, 2) in metres whether each differs from the one before it (bool); the first does."""
+    """Return whether each of the points (n, 2) in metres differs from the one before it (bool); the first does."""
     return np.linalg.norm(np.diff(points, axis=0, prepend=np.inf), axis=1) >= REPEAT_M
 
 
@@ -230,8 +230,8 @@ def rows_from_knots(knots: ArrayLike, width_m: ArrayLike, closed: bool) -> np.nd
 def _unfold(border: np.ndarray, longest_m: float, closed: bool) -> np.ndarray:
     """Return a border whose folds are pulled together into the point where they cross.
 
-    A border on the inside of a bend tighter than half the road's width runs backwards for a while and
-    crosses itself; what lies between the two passages of the crossing is road.
+    A border on the inside of a bend tighter than half the road's width runs backwards for a while and crosses itself;
+    the area between the two passages of the crossing is road.
 
     Args:
         border: Points (n, 2); on a closed course the last equals the first.
@@ -264,7 +264,7 @@ def _unfold(border: np.ndarray, longest_m: float, closed: bool) -> np.ndarray:
 
 
 def _first_crossing(border: np.ndarray, closed: bool, begin: int) -> tuple[int, int, np.ndarray] | None:
-    """Return the first pair of segments from `begin` on that cross inside both, and where they cross."""
+    """Return the first pair of segments from `begin` on whose insides cross, and the crossing."""
     a, d = border[:-1], np.diff(border, axis=0)
     count = len(a)
     for i in range(begin, count - 2):
