@@ -34,17 +34,17 @@ laps (at most 1.3 m/s), and 10 degrees to either side at their median speed.
 """
 METADATA, PICTURE = "model_metadata.json", "actions.png"
 FREE = ["action_space=continuous", "action_space.speed.high=4"]
-"""What the fastest lap of a track may command: in the words of `tracks NAME --fastest`."""
+"""Overrides that limit the commands of a track's fastest lap, as for `tracks NAME --fastest`."""
 
 
 class _Source(NamedTuple):
-    """Where the commands come from."""
+    """The source of the commands."""
 
     name: str
     commands: "Commands"
     car: "CarConfig"
     metadata: "ModelMetadata"
-    """With the sensors, network and version that the written file has."""
+    """Metadata with the sensors, network and version for the written file."""
 
 
 def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -130,7 +130,7 @@ def _actions(args: argparse.Namespace) -> int:
 
 
 def write_lap_actions(wanted: "LapActions") -> None:
-    """Write the lists of actions that are no option yet, from the fastest lap of the car on the track.
+    """Write the action lists that are not options yet, from the fastest lap of the car on the track.
 
     Raises:
         BadInput: a file cannot be written.

@@ -156,13 +156,13 @@ def _analyze(args: argparse.Namespace) -> int:
 
 
 def _wants_laps_only(args: argparse.Namespace) -> bool:
-    """Return whether a lap is asked for, and nothing of what the page shows."""
+    """Return whether only laps are wanted, and no page."""
     shown = args.output is not None or args.open or args.fastest
     return not (shown or args.reward or args.target) and (args.replay is not None or args.line is not None)
 
 
 def _write_laps_asked_for(args: argparse.Namespace, view: "LogView", episode: int | None) -> list[str]:
-    """Write the page of two laps and the line of one, where they are asked for; return where they are.
+    """Write the page of two laps and the line of one, if requested; return their places.
 
     Raises:
         BadInput: the log has no such lap, or a file cannot be written.

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from deepracer_exp.lookup.resolve import StoredRun
 
 STORES = ("runs_dir", "tracking.uri")
-"""Where runs are, and the MLflow store in which ids and aliases are looked up."""
+"""The folder of runs, and the MLflow store in which ids and aliases are looked up."""
 
 _OVERRIDE = re.compile(r"[+~]*[A-Za-z_][\w./@-]*=.*", re.DOTALL)
 
@@ -118,7 +118,7 @@ def is_override(word: str) -> bool:
 
 @dataclass(frozen=True)
 class Stores:
-    """Where runs are looked up."""
+    """The place to look up runs."""
 
     runs_dir: Path
     uri: str | None
@@ -157,7 +157,7 @@ def read_stores(overrides: Iterable[str], keys: Sequence[str] = ()) -> Stores:
 
 
 def split_stores(overrides: Iterable[str]) -> tuple[Stores, list[str]]:
-    """Read where runs are and return the other overrides as they are."""
+    """Read the place of runs and return the other overrides unchanged."""
     words = list(overrides)
     stores = [word for word in words if word.partition("=")[0] in STORES]
     return read_stores(stores), [word for word in words if word not in stores]

@@ -104,7 +104,7 @@ def _compare(args: argparse.Namespace) -> int:
 
 
 def _item(word: str, group: str | None, stores: Stores) -> Item:
-    """Find what a word means: a run, an experiment or study, or logs."""
+    """Resolve a word: a run, an experiment or study, or logs."""
     path = existing_logs(word)
     if path is None or not is_run(path):
         folders = [path] if path is not None else []
@@ -119,7 +119,7 @@ def _item(word: str, group: str | None, stores: Stores) -> Item:
 
 
 def _compare_recordings(args: argparse.Namespace, items: Sequence[Item]) -> int:
-    """Compare how logs, and runs among them, learned."""
+    """Compare the learning curves of logs, and of runs among them."""
     from deepracer_exp.analysis.beside import evaluated_in_training
     from deepracer_exp.analysis.charts.runs import (
         generalisation_matrix,

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _RUNS = "Runs"
 _MOST_GROUPS = 12
-"""Groups that are shown; of more those with the best race score."""
+"""Most groups shown, those with the best race score."""
 _ACHIEVED = (
     f"Laps, completion and race score are those of the best checkpoint in {TRAINING_LAPS}, which take the most "
     "probable actions."
@@ -89,7 +89,7 @@ def _groups(items: Sequence[Item]) -> "list[RunGroup]":
         pool = item.word if several and item.is_experiment and item.group is None else ""
         pairs = pools.setdefault(pool, [])
         for path in item.paths:
-            # Runs that have only begun are no reason to refuse an experiment.
+            # Runs without an iteration do not make an experiment invalid.
             if item.is_experiment and not (path / METRICS).is_file():
                 continue
             pair = item.group, read(path)
@@ -108,7 +108,7 @@ def _groups(items: Sequence[Item]) -> "list[RunGroup]":
 
 
 def _best(groups: "list[RunGroup]") -> "list[RunGroup]":
-    """Return the groups that are shown."""
+    """Return the groups to show."""
     if len(groups) <= _MOST_GROUPS:
         return groups
 
@@ -126,7 +126,7 @@ def _show(
     of_all: int,
     records: "list[RunRecord]",
 ) -> None:
-    """Print what is compared and write the page."""
+    """Print the comparison and write the page."""
     from deepracer_exp.analysis.charts.groups import best_checkpoints, learning_curve_charts
     from deepracer_exp.analysis.charts.runs import generalisation_matrix, stored_completion
     from deepracer_exp.analysis.group_tables import differences_table, scored, sentences, title_of
@@ -168,9 +168,9 @@ def _show(
 
 
 def _run_tables(groups: "Sequence[RunGroup]") -> "list[tuple[str, Table, str]]":
-    """Return in which settings runs differ, what each achieved, and which there are.
+    """Return tables of differing settings, of results and of runs.
 
-    Of several groups with several runs, settings are those of the groups, and the results of each run are left out.
+    With several groups of several runs, settings are those of the groups, and results of single runs are left out.
     """
     from deepracer_exp.analysis.comparison import results, value_text
     from deepracer_exp.analysis.log_tables import Table

@@ -1,4 +1,4 @@
-"""`deepracer-exp evaluate`, `check`, `watch` and `checkpoints`: how good a run is."""
+"""`deepracer-exp evaluate`, `check`, `watch` and `checkpoints`: the quality of a run."""
 
 import argparse
 import ctypes.util

@@ -74,7 +74,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def picture_file(output: str) -> str:
-    """Return where a picture is written: without an ending, matplotlib appends this one."""
+    """Return the file of a picture: without an ending, matplotlib appends this one."""
     return output if Path(output).suffix else f"{output}.png"
 
 

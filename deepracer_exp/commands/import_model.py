@@ -29,14 +29,14 @@ from deepracer_exp.training.run import store_run
 
 _CHECKPOINT = "checkpoint="
 _PARAMS = "training_params.yaml"
-"""The file of a trained model that says on which track and against whom the service trained it."""
+"""The file of a trained model with the track and the opponents of its training."""
 _CHOSEN_HERE = ("sensor", "neural_network", "lidar_config")
-"""Keys of model_metadata.json that have no effect where only options are made of the files."""
+"""Keys of model_metadata.json without effect if the files become options only."""
 
 
 @dataclass(frozen=True)
 class Imported:
-    """The run that a model became, and remarks on it."""
+    """The run made from a model, with notes."""
 
     folder: Path
     """Folder of the run."""

@@ -1,4 +1,4 @@
-"""What `analyze`, `compare` and `watch` share: the runs and logs they take, and the pages they write."""
+"""Arguments and pages shared by `analyze`, `compare` and `watch`."""
 
 import argparse
 from collections.abc import Sequence
@@ -59,7 +59,7 @@ def page_name(kind: str, name: str) -> Path:
 
 
 def end_with_page(page: Path, is_opened: bool) -> None:
-    """Print where the page is, and open it."""
+    """Print the page's place, and open it."""
     print(f"\n  page  {page}")
     if is_opened:
         import webbrowser
@@ -107,18 +107,18 @@ def find_run(what: str, stores: Stores) -> "StoredRun":
 
 @dataclass(frozen=True)
 class Item:
-    """What a word of the command line means."""
+    """A resolved word of the command line."""
 
     word: str
     group: str | None
-    """Name of the group it was given to."""
+    """Name of its group."""
     paths: tuple[Path, ...]
     """Folders of runs, or one file or folder of logs."""
     is_experiment: bool = False
 
     @property
     def is_logs(self) -> bool:
-        """Whether it is no run of ours."""
+        """Whether it is a log of the service."""
         return not is_run(self.paths[0])
 
 
@@ -129,7 +129,7 @@ def write_comparison_page(
     tables: "Sequence[tuple[str, Table, str]]",
     charts: "Sequence[Chart | None]",
 ) -> Path:
-    """Write the page of a comparison, by default under the names of what is compared; return where it is.
+    """Write the page of a comparison, by default named after the compared runs and logs; return where it is.
 
     Raises:
         BadInput: it cannot be written.

@@ -180,7 +180,7 @@ def _lineage(args: argparse.Namespace) -> int:
 
 
 def _label(member: "FamilyMember", run: Path, best: dict[int, str]) -> "Text":
-    """Return two lines: what the run is and achieved, and what it changed."""
+    """Return two lines: the run with its result, and its changes."""
     from rich.text import Text
 
     from deepracer_exp.analysis.comparison import value_text
@@ -300,7 +300,7 @@ def _clean(args: argparse.Namespace) -> int:
 
 
 def _overview(uri: str | None, runs_dir: Path) -> "tuple[StoreOverview | None, str | None]":
-    """Ask MLflow if there is a store; return what it knows, or what is skipped because it does not answer."""
+    """Query MLflow if there is a store; return its overview, or a note on what is skipped without an answer."""
     from deepracer_exp.tracking.registry import read_overview
     from deepracer_exp.tracking.store import existing_store, has_store
 

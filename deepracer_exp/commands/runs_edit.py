@@ -1,4 +1,4 @@
-"""`deepracer-exp runs send`, `rename`, `note`, `tag` and `delete`: what is done to single runs."""
+"""`deepracer-exp runs send`, `rename`, `note`, `tag` and `delete`: changes to single runs."""
 
 import argparse
 import shlex
@@ -123,7 +123,7 @@ class _Target:
         )
 
     def write(self, labels: "Labels") -> None:
-        """Write labels into the folder and into MLflow; if that lacks them, say so."""
+        """Write labels into the folder and into MLflow; warn if MLflow lacks them."""
         from deepracer_exp.lookup.next_steps import own_word
         from deepracer_exp.runs.labels import write_labels
         from deepracer_exp.tracking.delivery import deliver_labels

@@ -1,4 +1,4 @@
-"""The console of all commands: what comes from a file reaches the terminal as text, never as an escape sequence."""
+"""The console of all commands: contents of files reach the terminal as text, never as escape sequences."""
 
 import sys
 from collections.abc import Iterable
@@ -12,7 +12,7 @@ from deepracer_exp.streams import shown
 
 
 class Terminal(Console):
-    """A console of Rich whose cells and lines hold nothing that a terminal would obey; its own styles it does."""
+    """A console of Rich that removes control characters from cells and lines, but writes its own styles."""
 
     def __init__(self, *, stderr: bool = False, **options: Any) -> None:
         """Write to standard output or error; `options` are those of Rich's console."""

@@ -135,7 +135,7 @@ def _list_tracks() -> None:
 
 
 def _show_track(args: argparse.Namespace) -> None:
-    """Draw a track, or a route file (.npy, .yaml), in the terminal; write what is asked for."""
+    """Draw a track, or a route file (.npy, .yaml), in the terminal; write the requested files."""
     from deepracer_exp.analysis.line_file import check_line_file, racing_line_table, write_line
     from deepracer_exp.config.overrides import override_line
     from deepracer_exp.tracks.drawing import draw_picture, draw_terminal
@@ -185,7 +185,7 @@ def experiment_on(overrides: list[str]) -> "tuple[Experiment, Track]":
 
 
 def search_fastest(experiment: "Experiment", track: "Track") -> "FastestLap":
-    """Return the fastest lap; a search prints on standard error what it searches, and how far it is.
+    """Return the fastest lap; a search prints its subject and progress on standard error.
 
     Raises:
         BadInput: as for `Question.of`.

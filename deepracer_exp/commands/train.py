@@ -256,7 +256,7 @@ not answer; 130, 143 interrupted
 """
 _WORDS = ("report", "best")
 _WORKER = "deepracer_exp.sweeps.queue.worker"
-"""What a fork server imports once for all workers."""
+"""Modules that a fork server imports once for all workers."""
 
 
 def _sweep(args: argparse.Namespace) -> int:

@@ -38,7 +38,7 @@ from .trace import TraceRecorder
 _TIMES = ("lap s", "median", "best", "std", "score s")
 _MINOR = ("median", "std", "score s", "zig-zag /m")
 SIMULATOR, CAR = "simulator", "car"
-"""Names of what is compared, beside the parts of `RealCarConfig`."""
+"""Names of the compared races, beside the parts of `RealCarConfig`."""
 _PARTS = tuple(field.name for field in fields(RealCarConfig))
 
 
@@ -102,8 +102,8 @@ def write_evaluation(
 ) -> Path:
     """Write `evaluations/<time>.json` into a run's folder and return it.
 
-    `car` and `places` are what `race_car_parts` and `official_places` return; `rival` names the run and checkpoint that
-    drove the other car, None: there was none, or the policy itself.
+    `car` and `places` are the results of `race_car_parts` and `official_places`; `rival` names the run and checkpoint
+    that drove the other car, None: there was none, or the policy itself.
 
     Raises:
         RunFailed: the file cannot be written.
@@ -238,7 +238,7 @@ def evaluate_run(
 
 
 def _against(plan: EvaluatePlan, rival: StoredPolicy | None, evaluator: Evaluator) -> str:
-    """Return whom the policy races against, in words."""
+    """Name the policy's rival."""
     if plan.rival is not None and rival is not None:
         return f" against {plan.rival.path.name}, checkpoint {rival.path.name}"
     return " against itself" * isinstance(evaluator.race, HeadToHead)
@@ -247,7 +247,7 @@ def _against(plan: EvaluatePlan, rival: StoredPolicy | None, evaluator: Evaluato
 def official_places(
     experiment: Experiment, config: EvaluationConfig, evaluation: Evaluation
 ) -> dict[str, list[Standing]]:
-    """Return where the usual laps would stand on the official boards of each track that has any, the best known first.
+    """Return the places of the usual laps on the official boards of each track that has any, the best known first.
 
     The boards are those of time trials in the simulator: laps among boxes or bots have no place there, nor have those
     driven as the physical car does.
@@ -341,7 +341,7 @@ def car_figures(evaluations: Mapping[str, Evaluation]) -> dict[str, dict[str, An
 
 
 def car_table(evaluations: Mapping[str, Evaluation]) -> Table:
-    """Return what is lost under usual conditions as a table: simulator, each part of the car alone, all of them."""
+    """Return the losses under usual conditions as a table: simulator, each part of the car alone, all of them."""
     figures = car_figures(evaluations)
     base = figures[SIMULATOR]
     shown = Table(
@@ -370,7 +370,7 @@ def car_table(evaluations: Mapping[str, Evaluation]) -> Table:
 
 
 def explain_controls(experiment: Experiment, config: EvaluationConfig) -> list[str]:
-    """Return what the car makes of the action space, in words."""
+    """Describe the car's response to the action space."""
     controls = None if config.real_car is None else config.real_car.controls
     if controls is None:
         return []

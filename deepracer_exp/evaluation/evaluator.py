@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from deepracer_exp.analysis.zigzag import ZigZag
 
 OnStep = Callable[[Race, RaceProtocol, TensorDict], None]
-"""Gets the cars, the protocol, and what the policy read and wrote in this step, [trials]."""
+"""Receives the cars, the protocol, and the policy's inputs and outputs in this step, [trials]."""
 
 _DRIVEN = [PACKED[name] for name in ("X", "Y", "steer", "tstamp", "episode_status")]
 
@@ -56,7 +56,7 @@ class Evaluator:
     Attributes:
         trials: one for each row of the batch.
         race: the cars.
-        rival: drives the other car of a race head to head, where a call names no other; None: the policy itself.
+        rival: drives the other car of a head-to-head race unless a call names another; None: the policy itself.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class Evaluator:
                 not set.
             config: the protocol.
             threads: physics threads; 0 means one per core.
-            rival_sees: what the rival's policy observes, where the race is head to head; None: as the policy.
+            rival_sees: observation of the rival's policy in a head-to-head race; None: the policy's.
 
         Raises:
             BadInput: a track, a condition or a file is unknown or malformed, or the protocol is that of the car and
@@ -124,9 +124,9 @@ class Evaluator:
         """Let the policy drive all trials and return the results.
 
         Args:
-            policy: reads what the experiment observes, writes `action`.
+            policy: reads the experiment's observation, writes `action`.
             on_step: called after every control step.
-            rival: drives the other car of a race head to head; None: `self.rival`.
+            rival: drives the other car of a head-to-head race; None: `self.rival`.
 
         Raises:
             RunFailed: an action or a car's state became NaN or infinite.
@@ -153,7 +153,7 @@ class Evaluator:
                 if compiled is None or on_step is not None:
                     acted = policy(acted)
                 if compiled is not None:
-                    # So that the laps are the same whether or not someone looks at each step.
+                    # So that the laps do not depend on whether `on_step` is given.
                     acted["action"] = torch.from_numpy(compiled.likeliest(race.observation))
                 race.step(acted["action"].numpy())
                 row = race.trace

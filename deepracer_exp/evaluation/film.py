@@ -109,7 +109,7 @@ def in_frames(lap: Lap, control_hz: float) -> tuple[Lap, NDArray[np.intp]]:
 
 
 class LapRecorder:
-    """Records the trace of all trials while they are driven, and of one lap what the policy read and wrote."""
+    """Records the trace of all trials, and the policy's inputs and outputs in one lap."""
 
     def __init__(self, evaluator: Evaluator, seen_in: Attempt | None = None) -> None:
         """Record the next evaluation.
@@ -135,7 +135,7 @@ class LapRecorder:
 
     @property
     def acted(self) -> TensorDict:
-        """The tensors that the policy read and wrote in the lap `seen_in`, [n]."""
+        """The policy's inputs and outputs in the lap `seen_in`, [n]."""
         return torch.stack(self._acted)
 
     def rows(self, attempt: Attempt) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
@@ -199,7 +199,7 @@ def drive_best_lap(evaluator: Evaluator, policy: nn.Module) -> tuple[Lap, Tensor
     """Drive all trials, and again to record the fastest usual lap: every drive of a policy is the same.
 
     Returns:
-        The lap of n steps, and what the policy read and wrote in these, [n].
+        The lap of n steps, and the policy's inputs and outputs in these, [n].
     """
     best = best_attempt(evaluator(policy))
     recorder = LapRecorder(evaluator, best)

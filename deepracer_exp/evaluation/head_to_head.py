@@ -46,8 +46,8 @@ class RivalProtocol:
     def results(self, cars: RaceProtocol) -> tuple[float, ...]:
         """Return for each car whether it has won against its rival: `WON`, `DRAWN` or `LOST`.
 
-        Whoever finishes the laps first has won. If the time is up before, it is who has come further; a car whose last
-        lap has failed has lost.
+        The car that finishes the laps first wins. If the time is up before, the car with more progress wins; a car
+        whose last lap has failed has lost.
         """
         results = []
         for trial in range(len(self._driven)):
@@ -64,7 +64,7 @@ class RivalProtocol:
         return tuple(results)
 
     def _finish_s(self, attempts: list[Attempt]) -> float | None:
-        """Return the race clock at the end of the last lap; None: that was not driven."""
+        """Return the race clock at the end of the last lap; None if that was not completed."""
         complete = [attempt for attempt in attempts if attempt.complete]
         if self._laps is None or len(complete) < self._laps:
             return None

@@ -1,4 +1,4 @@
-"""What a command that races a stored policy was asked, with the answers; nothing here imports PyTorch."""
+"""The plan of a command that races a stored policy, resolved before PyTorch is imported."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ from deepracer_exp.lookup.rival import find_rival, kept_rival
 
 @dataclass(frozen=True)
 class EvaluatePlan:
-    """A stored policy, and how it is raced."""
+    """A stored policy and the protocol of its races."""
 
     run: StoredRun
     """The run, with its checkpoint."""

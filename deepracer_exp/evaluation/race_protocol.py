@@ -32,9 +32,9 @@ class Attempt:
     progress: float
     """Per cent of the lap, 100 if complete."""
     end: str
-    """`lap_complete`, what failed it (`off_track`, `crashed`, `reversed`, `immobilized`), or `time_up`."""
+    """`lap_complete`, the reason of its failure (`off_track`, `crashed`, `reversed`, `immobilized`), or `time_up`."""
     crashes: int = 0
-    """How often the car ran into a box or bot and was at fault."""
+    """Number of crashes into a box or bot by the car's own fault."""
 
     @property
     def complete(self) -> bool:
@@ -43,12 +43,12 @@ class Attempt:
 
     @property
     def crash_free(self) -> bool:
-        """Whether it counts as a lap, and the car ran into nothing."""
+        """Whether it counts as a lap without a crash."""
         return self.complete and not self.crashes
 
     @property
     def cut_off(self) -> bool:
-        """Whether the end of the race interrupted it."""
+        """Whether the end of the race interrupted the lap."""
         return self.end == _UP
 
 
@@ -66,7 +66,7 @@ class PutBack(NamedTuple):
 
 
 class RaceProtocol:
-    """Applies a protocol to N cars, one trial each: which are put back, and which have finished.
+    """Applies a protocol to N cars, one trial each: decides which are put back and which have finished.
 
     The race clock of a trial is that of `rules.lap_clock_s`, which starts with the reset before the prepare step. A car
     alone on the track continues at once, and a penalty advances its clock by its seconds; among others it is held for

@@ -31,8 +31,7 @@ _RESAMPLES = 9999
 class TrialGroup:
     """Trials on one track under one condition, or several such groups combined.
 
-    A lap interrupted by the end of the race says nothing about the policy and does not count, unless its trial has
-    no other.
+    A lap interrupted by the end of the race does not count, unless its trial has no other.
     """
 
     track: str

@@ -1,4 +1,4 @@
-"""The control steps of an evaluation as the service writes them, and where the others around them were."""
+"""The control steps of an evaluation in the service's format, with the places of boxes, bots and rivals."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,7 +22,7 @@ class TraceRecorder:
     """Records the control steps of all trials; each trial is an episode."""
 
     def __init__(self, config: EvaluationConfig) -> None:
-        """Begin without a step; `config` is the protocol."""
+        """Start empty; `config` is the protocol."""
         self._penalty_s = vars(config.penalty_s)
         self._steps: list[NDArray[np.float64]] = []
         self._running: NDArray[np.bool_] | None = None

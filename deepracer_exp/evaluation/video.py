@@ -80,7 +80,7 @@ def render_lap(lap: Lap, car: CarConfig) -> Iterator[NDArray[np.uint8]]:
 
 
 def _build(track: Track, car: CarConfig, others: NDArray[np.float64]) -> mujoco.MjModel:
-    """Build what is seen: the car on its track, and boxes and bots that are moved, (K, 9)."""
+    """Build the scene: the car on its track, and movable boxes and bots, (K, 9)."""
     low, high = extent(track)
     spec = build_spec(car, visual=True)
     vis = spec.visual

@@ -69,7 +69,7 @@ def services_metadata(experiment: Experiment) -> ModelMetadata:
 
 
 def sensor_keys(observation: ObservationConfig) -> dict[str, Any]:
-    """Return the keys of a model's metadata for what is observed; the service's models all have a camera."""
+    """Return the keys of a model's metadata for the observation; the service's models all have a camera."""
     stereo = observation.camera is not None and observation.camera.stereo_m > 0
     camera, lidar = "STEREO_CAMERAS" if stereo else "FRONT_FACING_CAMERA", observation.lidar
     if lidar is None:

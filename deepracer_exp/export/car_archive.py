@@ -1,4 +1,4 @@
-"""A policy of ours as the archive that the software of a physical car loads."""
+"""A policy of ours as the archive for a physical car."""
 
 import json
 import shlex
@@ -42,20 +42,20 @@ from .written import Written, checkpoint_line, write_file
 
 
 class Rescaling(NamedTuple):
-    """How to rescale the outputs [steering, speed], clipped to -1..1: factor * output + shift; (2,) each."""
+    """Rescaling of the outputs [steering, speed], clipped to -1..1: factor * output + shift; (2,) each."""
 
     factor: NDArray[np.float64]
     shift: NDArray[np.float64]
 
 
 class CarArchive(NamedTuple):
-    """What is uploaded to a car."""
+    """The archive to upload to a car."""
 
     files: Mapping[str, bytes]
     """Content by name, in the order in which they are packed."""
     metadata: ModelMetadata
     notes: list[str]
-    """One for each change, and for each thing that the car does differently."""
+    """One for each change and each deviation of the car."""
 
     def content(self) -> bytes:
         """Return the .tar.gz."""
@@ -65,7 +65,7 @@ class CarArchive(NamedTuple):
 def export_car(
     run: StoredRun, path: Path, add: Callable[[CarArchive], CarArchive] = lambda archive: archive
 ) -> Written:
-    """Write the archive of a policy for a physical car, with what `add` adds to it.
+    """Write the archive of a policy for a physical car, with the additions of `add`.
 
     Arguments, result and errors as for `export.Writer`.
     """

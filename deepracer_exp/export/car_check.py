@@ -1,4 +1,4 @@
-"""The command `check --car`: what will happen when a policy drives the physical car, and whether it is ready for it."""
+"""The command `check --car`: predict a policy's driving on the physical car, and whether it is ready."""
 
 import time
 from collections.abc import Mapping
@@ -50,7 +50,7 @@ from .onnx import DeployedPolicy
 LEAST_ON_CAR = 0.9
 """Share of complete laps wanted with each part of the car and with all; in the simulator it is `RELIABLE`."""
 LEAST_FACTOR = 4.0
-"""Pictures that the network must read here, on one core, in the time of one on the car, whose processor is slower."""
+"""Least real-time factor here, on one core; the car's processor is slower."""
 MOST_BAD = 0.05
 """Share of a lap's pictures that may decide badly."""
 LEAST_SAME = 0.99
@@ -72,7 +72,7 @@ class CarLaps:
 
 @dataclass(frozen=True)
 class CarCheck:
-    """What was found out about a policy on the car."""
+    """Results of the check of a policy for the car."""
 
     laps: Mapping[str, CarLaps]
     """Without a part of the car, with each, and with all, by the names of `car_protocols` and `CAR`."""
@@ -83,7 +83,7 @@ class CarCheck:
     pictures: TriedPictures
     """The pictures of the best lap with all parts of the car."""
     conversion: Conversion | None
-    """What the car's converter decides on these pictures; None: it is not installed."""
+    """Decisions of the car's converter on these pictures; None: it is not installed."""
 
     @property
     def factor(self) -> float:
@@ -96,7 +96,7 @@ class CarCheck:
         return self.laps[CAR].evaluation.on(USUAL).zigzag
 
     def to_do(self) -> list[str]:
-        """Return what to do before the drive, the most important first; nothing if the policy is ready."""
+        """Return remedies before the drive, the most important first; empty if the policy is ready."""
         steps = []
         if self.factor < LEAST_FACTOR:
             steps.append(
@@ -106,14 +106,14 @@ class CarCheck:
         figures = car_figures({name: laps.evaluation for name, laps in self.laps.items()})
         shares = {name: figure["lap_share"] for name, figure in figures.items()}
         weak = [name for name in self.laps if name != SIMULATOR and shares[name] < LEAST_ON_CAR]
-        if not shares[SIMULATOR]:  # nothing that is seen of such a policy says anything of a trained one
+        if not shares[SIMULATOR]:  # results of such a policy do not apply to a trained one
             return [
                 *steps,
                 "in the simulator no lap is complete: the policy has not learned to drive; train it for longer "
                 "(deepracer-exp resume RUN budget.env_steps=N)",
             ]
         if shares[SIMULATOR] < RELIABLE:
-            weak = []  # what fails in the simulator already says nothing of the car
+            weak = []  # failures in the simulator itself do not concern the car
             steps.append(
                 f"in the simulator {shares[SIMULATOR]:.0%} of the laps are complete, wanted {RELIABLE:.0%}; train "
                 "further (deepracer-exp clone)"
@@ -141,7 +141,7 @@ class CarCheck:
 
 
 def check_run(plan: EvaluatePlan, picture: Path | None, out: Console, err: Console) -> CarCheck:
-    """Race a run's checkpoint as the car sees and acts, and print what will happen on the car.
+    """Race a run's checkpoint with the car's camera, timing and controls, and print the results.
 
     Args:
         plan: of an evaluation with `real_car`.
@@ -206,7 +206,7 @@ def check_run(plan: EvaluatePlan, picture: Path | None, out: Console, err: Conso
 def print_check(
     check: CarCheck, archive: CarArchive, experiment: Experiment, config: EvaluationConfig, out: Console
 ) -> None:
-    """Print what was found out in tables that fit 80 columns, and in sentences."""
+    """Print the results in tables that fit 80 columns, and in sentences."""
 
     def say(*lines: str) -> None:
         for line in lines:
@@ -245,7 +245,7 @@ _NAMES = {SIMULATOR: "in the simulator", CAR: "as on the car"}
 def _converted(
     archive: CarArchive, networks: PolicyNetworks, actions: ActionSpace, acted: TensorDict
 ) -> Conversion:
-    """Compare what OpenVINO decides with the policy on what was seen in n steps, [n]."""
+    """Compare OpenVINO's decisions with the policy's on the observations of n steps, [n]."""
     deployed = DeployedPolicy(networks, actions).eval()
     return compare_in_openvino(archive, deployed, [acted[key] for key in deployed.in_keys])
 
@@ -271,7 +271,7 @@ def laps_table(laps: Mapping[str, CarLaps]) -> Table:
 
 
 def figures_table(check: CarCheck) -> Table:
-    """Return the figures that are not of laps, with what is wanted, as a table."""
+    """Return the figures that are not of laps, with their wanted values, as a table."""
     shown = Table(box=None, pad_edge=False)
     for name in ("what", "on the car", "wanted"):
         shown.add_column(name, no_wrap=True)

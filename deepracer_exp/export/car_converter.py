@@ -1,4 +1,4 @@
-"""The archive of a policy in OpenVINO, as the software of a physical car converts and runs it.
+"""The archive of a policy in OpenVINO, converted and run as by a physical car.
 
 Source: deepracer-custom-car 2.1.9.9 (model_optimizer_node.py: weights are stored in half precision, and a model.xml of
 OpenVINO 2022 or later that lies beside model.pb is taken as it is; intel_ov_inference_eng.cpp: one picture at a time,
@@ -37,7 +37,7 @@ Floats = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True)
 class Conversion:
-    """What OpenVINO decides on n pictures beside the policy of the archive."""
+    """Decisions of OpenVINO on n pictures, compared with the archive's policy."""
 
     same: NDArray[np.bool_]
     """Whether steering and speed are the same up to `SAME` of their ranges, (n,)."""
@@ -45,7 +45,7 @@ class Conversion:
     """Largest difference of a probability; of a continuous policy, of steering or speed as a share of its range."""
 
     def words(self) -> str:
-        """Return how often the commands are the same: ``same action on 242 of 242 pictures``."""
+        """Return the number of equal commands: ``same action on 242 of 242 pictures``."""
         return f"same action on {self.same.sum():,} of {len(self.same):,} pictures"
 
 
@@ -87,11 +87,11 @@ def add_converted(archive: CarArchive) -> CarArchive:
 
 
 def run_in_openvino(archive: CarArchive, seen: Sequence[Tensor]) -> Floats:
-    """Return what the graph in an archive gives in OpenVINO, (n, outputs).
+    """Return the outputs of an archive's graph in OpenVINO, (n, outputs).
 
     Args:
         archive: of the policy.
-        seen: what `DeployedPolicy` reads: pictures (n, channels, height, width), bytes, then readings of a LIDAR.
+        seen: the inputs of `DeployedPolicy`: pictures (n, channels, height, width), bytes, then readings of a LIDAR.
     """
     import openvino
 
@@ -114,7 +114,7 @@ def run_in_openvino(archive: CarArchive, seen: Sequence[Tensor]) -> Floats:
 
 
 def compare_in_openvino(archive: CarArchive, policy: DeployedPolicy, seen: Sequence[Tensor]) -> Conversion:
-    """Compare what an archive's graph decides in OpenVINO with its policy; arguments as for `run_in_openvino`."""
+    """Compare the decisions of an archive's graph in OpenVINO with its policy; arguments as for `run_in_openvino`."""
     outputs = run_in_openvino(archive, seen)
     with torch.no_grad():
         ours, commands = (values.numpy() for values in policy(*seen))

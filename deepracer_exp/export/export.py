@@ -28,11 +28,11 @@ WRITERS: Mapping[str, tuple[Writer, Callable[[StoredRun], str]]] = {
     "aws": (export_files, lambda run: "aws"),
     "aws-model": (export_model, lambda run: "aws-model"),
 }
-"""The writer of each format, and what it writes into the run's folder of exports where no output is given."""
+"""The writer of each format, and its default file in the run's folder of exports."""
 
 
 def export(run: StoredRun, format: str, output: str | None, out: Console) -> Path:
-    """Export a run in a format and print what was written; errors as for `Writer`."""
+    """Export a run in a format and print the result; errors as for `Writer`."""
     write, name = WRITERS[format]
     path = Path(output or run.path / EXPORTS / name(run))
     files, lines = write(run, path)

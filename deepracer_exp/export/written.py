@@ -1,4 +1,4 @@
-"""What the writers of all export formats share: the policy that is exported, and the files that are written."""
+"""Shared by the writers of all export formats: the policy that is exported, and the files that are written."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path

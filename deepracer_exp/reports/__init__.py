@@ -1,1 +1,1 @@
-"""Pages, films of what a policy sees, and comparisons: what analysis and evaluation found, drawn and written."""
+"""Pages, films of a policy's view, and comparisons: the results of analysis and evaluation."""

@@ -1,4 +1,4 @@
-"""The best policy of a run, driven again for its page: its fastest evaluated lap, and what it sees along one."""
+"""The best policy of a run, driven again for its page: its fastest evaluated lap, and its views along a lap."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,15 +20,15 @@ from .sight import glimpses
 
 @dataclass(frozen=True, eq=False)
 class BestDrive:
-    """What the best policy of a run drives and sees."""
+    """The laps and views of a run's best policy."""
 
     lap: EvaluatedLap | None = None
     strip: tuple[Glimpse, ...] = ()
-    """Pictures along a lap; none of a policy that sees no pictures."""
+    """Pictures along a lap; empty for a policy without a camera."""
 
 
 def drive_best(view: LogView, folder: Path, just_trained: bool = False) -> tuple[LogView, BestDrive]:
-    """Return a recorded training's view and what its best policy drives on the usual conditions.
+    """Return a recorded training's view, and its best policy's driving under the usual conditions.
 
     A training stores no steps of its evaluations, but the same policy drives the same laps again. One that sees
     pictures drives a single lap: they take long.
@@ -40,7 +40,7 @@ def drive_best(view: LogView, folder: Path, just_trained: bool = False) -> tuple
             left out, since a recording may come from anywhere.
 
     Returns:
-        The view, with another problem if the policy could not be used; what it drives.
+        The view, with another problem if the policy could not be used; and the drive.
     """
     try:
         if not kept_checkpoints(folder / CHECKPOINTS):

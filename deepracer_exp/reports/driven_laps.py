@@ -26,7 +26,7 @@ def laps_to_replay(
     beside: ReplayedLap | None = None,
     ordinary: bool = False,
 ) -> list[ReplayedLap]:
-    """Race a run's checkpoint on the usual conditions and return its fastest lap, or the one that came farthest.
+    """Race a run's checkpoint under the usual conditions and return its fastest lap, or the one with most progress.
 
     The lap is one of those that began where `beside` did, if there are any. `ordinary` adds the median of the other
     complete laps, of those from the same start if there are any.
@@ -85,7 +85,7 @@ def commands_of_run(run: StoredRun) -> Commands:
         tried = count(len(evaluation.on(USUAL).attempts), "lap")
         raise BadInput(name, f"completes none of {tried} without a reset", "a run that does")
     rows = np.concatenate(steps)
-    # In the prepare step nothing is commanded yet.
+    # The prepare step has no command yet.
     rows = rows[rows[:, PACKED["episode_status"]] != STATUS_CODE["prepare"]]
     return Commands(
         laps="; ".join(words),

@@ -26,7 +26,7 @@ from .page import plot_of, render
 COLORS = (BLUE, ORANGE)
 _DIGITS = 4
 _SAME_START = 0.02
-"""Share of the track that two laps may begin apart: else one would drive elsewhere, not beside the other."""
+"""Largest distance between the starts of two laps, as a share of the track, so that they drive side by side."""
 _BESIDE = 0.05
 """Share of the rows of a lap that may be far beside its track."""
 
@@ -36,14 +36,14 @@ class ReplayedLap:
     """A lap as it is replayed; all arrays are (n,)."""
 
     name: str
-    """The run or log that it is of."""
+    """The run or log of the lap."""
     words: str
     """Description of the lap."""
     track: Track
     lap_time_s: float
     """NaN of a lap that is not complete."""
     time_s: Values
-    """Since the lap began, by the clock of its lap time."""
+    """Seconds since the lap began, by the clock of its lap time."""
     x_m: Values
     y_m: Values
     yaw_deg: Values
@@ -108,7 +108,7 @@ def fastest_lap_of_log(view: LogView, beside: ReplayedLap | None = None) -> Repl
 
 
 def is_same_start(places: Values, beside: ReplayedLap) -> NDArray[np.bool_]:
-    """Return which places, shares of the track (n,), are the start of a lap."""
+    """Return whether places, shares of the track (n,), are the start of a lap."""
     return np.abs((places - beside.driven[0] + 0.5) % 1.0 - 0.5) < _SAME_START
 
 
@@ -179,7 +179,7 @@ def _time(seconds: float) -> str:
 
 
 def _values(lap: ReplayedLap, first: ReplayedLap) -> dict[str, list[float]]:
-    """Return what the page moves a car by; from the same start, `driven` begins as in the first lap."""
+    """Return the data by which the page moves a car; from the same start, `driven` begins as in the first lap."""
     driven = lap.driven
     values = {
         "time_s": lap.time_s,

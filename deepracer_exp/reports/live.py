@@ -33,7 +33,7 @@ from .live_server import LiveServer
 from .sight import glimpses
 
 _EVERY_S = 1.0
-"""Seconds between two looks into the run's folder."""
+"""Seconds between two checks of the run's folder."""
 _CURVES_EVERY_S = 10.0
 """Seconds between two drawings of the curves of a run in progress: each loads the page again."""
 _LAST = "last"
@@ -45,7 +45,7 @@ Used: TypeAlias = Callable[[int, int, float], tuple[str, float]]
 
 @dataclass(frozen=True, kw_only=True)
 class _Laps:
-    """The laps of a checkpoint, as the page shows them."""
+    """The laps of a checkpoint for the page."""
 
     words: str
     plot: Plot
@@ -77,7 +77,7 @@ class LivePage:
         self._draw()
 
     def update(self) -> bool:
-        """Draw the page again if there is something newer; return whether there was."""
+        """Draw the page again if there is newer data; return whether there was."""
         written, ended = _seen(self._run.path)
         if ended != self._seen[1] or (
             written != self._seen[0] and time.monotonic() - self._drawn_s >= _CURVES_EVERY_S
@@ -151,7 +151,7 @@ class LivePage:
         self.shown = (version, page)
 
     def _clock(self, row: Mapping[str, Any], ended: bool) -> dict[str, Any]:
-        """Return what the page computes time and remaining time from, by the clock of this machine, in ms."""
+        """Return the values from which the page computes elapsed and remaining time, by this machine's clock, in ms."""
         used_s = float(row["wall_clock_s"])
         _, share = self._used(int(row["env_steps"]), int(row["iteration"]), used_s)
         now_ms = 1000 * (self._run.path / METRICS).stat().st_mtime
@@ -167,14 +167,14 @@ class LivePage:
 
 
 def _seen(run: Path) -> tuple[int, str]:
-    """Return what changes with the page: the size of the metrics, and how the run ended or whether it is running."""
+    """Return a version that changes with the page: the size of the metrics, and the ending or state of the run."""
     metrics, summary = run / METRICS, run / SUMMARY
     ended = "ended" if summary.exists() else "running" if is_held(run) else "killed"
     return metrics.stat().st_size if metrics.exists() else 0, ended
 
 
 def track_lines(evaluator: Evaluator, evaluation: Evaluation, recorder: LapRecorder) -> list[TrackLines]:
-    """Return the laps on the usual conditions, by track; those that the end of the race cut off do not count."""
+    """Return the laps on the usual conditions, by track; those interrupted by the end of the race do not count."""
     shown = []
     groups = [group for group in evaluation.groups if group.condition == USUAL]
     for course, group in zip(evaluator.race.setup.courses, groups, strict=True):

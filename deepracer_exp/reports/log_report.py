@@ -49,7 +49,7 @@ _EVALUATED = "The evaluated lap"
 _OF_FAILURES = ("What is on the road", "Where it goes wrong")
 """Sections on episodes that were no complete lap."""
 _PICTURES = ("evaluated_lap", "lap_line")
-"""The figure beside the outcome: the first of them that there is."""
+"""Figures beside the outcome, of which the first available one is shown."""
 SECTIONS: Mapping[str, Sequence[Callable[[LogView], Chart | None]]] = {
     "How it learned": (
         *(training.training_progress, training.learning_vs_lap_time, training.evaluations),
@@ -105,7 +105,7 @@ FIRST = (
     ),
     *("sector_times", "speed_steering_by_waypoint", "off_track_risk", "racing_line", "reward_by_waypoint"),
 )
-"""Names of the figures that matter most: those that were asked for, then the result, then where time is lost."""
+"""Names of the most important figures: the requested ones, then the result, then the loss of time."""
 MOST_FIRST = 6
 """Figures that are open when the page is opened; the others are folded."""
 
@@ -122,7 +122,7 @@ class LogPage:
     terms: pd.DataFrame | None = None
     """Contribution of each term of the reward function, as `contributed_terms` returns it."""
     best: "BestDrive | None" = None
-    """What the best policy of a run drives and sees."""
+    """The driving and views of a run's best policy."""
 
 
 def write_log_page(path: Path, page: LogPage) -> Path:
@@ -204,8 +204,8 @@ def html(page: LogPage) -> str:
 def _first_screen(page: LogPage) -> dict[str, Any]:
     """Return the title, the result in names and values, the place on the official board, and the next steps.
 
-    The title is the experiment's name, of a log that of its file. What to do next with a training is what its first
-    finding says; with a run of ours, commands follow, each with what it does. They take no checkpoints of the service.
+    The title is the experiment's name, of a log that of its file. The next step of a training is in its first finding;
+    for a run of ours, commands with their effects follow. They take no checkpoints of the service.
     """
     to_do = [("", finding.sentence) for finding in page.findings[: int(page.view.trained)]]
     folder = run_folder(page.view)

@@ -1,4 +1,4 @@
-"""HTML pages in a single file: text and tables, and figures that are packed until they are seen."""
+"""HTML pages in a single file: text, tables, and figures that stay packed until they are scrolled into view."""
 
 import base64
 import gzip
@@ -53,7 +53,7 @@ class Glimpse:
 
 
 def png_uri(png: bytes) -> str:
-    """Return the address of a picture that a page holds in itself."""
+    """Return a picture as a data URI."""
     return f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}"
 
 

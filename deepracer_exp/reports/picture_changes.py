@@ -1,4 +1,4 @@
-"""Pictures that decide badly: those in which a change that should not matter turns the wheels."""
+"""Pictures that decide badly: a small, irrelevant change of them turns the wheels."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -32,10 +32,10 @@ Pixels = NDArray[np.uint8]
 
 @dataclass(frozen=True, eq=False)
 class TriedPictures:
-    """The n pictures of a drive, and by how much small changes of them turn the steering."""
+    """The n pictures of a drive, and the change of steering by small changes of them."""
 
     acted: TensorDict
-    """What the policy read and wrote, [n]."""
+    """Inputs and outputs of the policy, [n]."""
     commands: Commands
     turned_deg: Mapping[str, NDArray[np.float64]]
     """By the name of the change, degrees of the action space, to the left, (n,) each."""
@@ -56,11 +56,11 @@ class TriedPictures:
         return len(self.bad) / len(self.commands[0])
 
     def words(self) -> str:
-        """Return how many there are: ``9 of 242 (4%)``."""
+        """Return their number: ``9 of 242 (4%)``."""
         return f"{len(self.bad)} of {len(self.commands[0])} ({self.bad_share:.0%})"
 
     def by_change(self) -> str:
-        """Return how many there are by the change: ``darker 5, blurred 4``."""
+        """Return their number by change: ``darker 5, blurred 4``."""
         least_deg = BAD_SHARE * self.full_lock_deg
         turned = {name: int((np.abs(deg) > least_deg).sum()) for name, deg in self.turned_deg.items()}
         return ", ".join(f"{name} {bad}" for name, bad in turned.items() if bad)
@@ -71,7 +71,7 @@ def _scaled(pixels: Pixels, factor: float) -> Pixels:
 
 
 def _lowered(pixels: Pixels, rows: int) -> Pixels:
-    """Return pictures that are so many rows further down; the row at the edge is repeated."""
+    """Shift pictures down by a number of rows; the row at the edge is repeated."""
     height = pixels.shape[-2]
     return pixels[..., np.clip(np.arange(height) - rows, 0, height - 1), :]
 
@@ -88,7 +88,7 @@ CHANGES: Mapping[str, Callable[[Pixels], Pixels]] = {
 
 
 def try_pictures(policy: nn.Module, acted: TensorDict, actions: ActionSpace) -> TriedPictures:
-    """Let a policy decide again on changed pictures; `acted` is what it read and wrote in n steps, [n]."""
+    """Let a policy decide again on changed pictures; `acted` has its inputs and outputs in n steps, [n]."""
     steering_deg, speed_mps = actions.commands(acted["action"].numpy())
     pixels = acted["pixels"].numpy()
     turned_deg = {}
@@ -102,13 +102,13 @@ def try_pictures(policy: nn.Module, acted: TensorDict, actions: ActionSpace) -> 
 
 
 def decide(policy: nn.Module, seen: TensorDict) -> TensorDict:
-    """Return what a policy reads and writes in n steps, its most probable actions, [n]."""
+    """Return a policy's inputs and outputs in n steps, with its most probable actions, [n]."""
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         return torch.cat([policy(part.clone()) for part in seen.split(_BATCH)])
 
 
 def spread_out(rows: NDArray[np.intp], place: NDArray[Any], least: float, most: int) -> list[int]:
-    """Return the first of some rows whose places are at least so far from one another, at most `most` of them."""
+    """Select the first of some rows whose places have a least distance from one another, at most `most`."""
     chosen: list[int] = []
     for row in rows.tolist():
         if len(chosen) == most:

@@ -56,7 +56,7 @@ def write_pictures(run_dir: Path, courses: Sequence[Course]) -> None:
 
 
 def write_run_page(run_dir: Path, car: CarConfig) -> str | None:
-    """Write `report.html`; return a line if there is no trace or that fails: no error here ends a training."""
+    """Write `report.html`; return a line if there is no trace or an error, since no error here ends a training."""
     if not has_trace(run_dir / TRACE):
         return f"no {REPORT}, no {BEST_LAP}: the run {missing_trace(run_dir)}"
     try:

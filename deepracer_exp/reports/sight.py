@@ -1,4 +1,4 @@
-"""What a policy sees, and where it looks: pictures of its camera, with the places that its decision depends on."""
+"""A policy's camera pictures and their saliency: the places that its decision depends on."""
 
 from functools import cache
 
@@ -29,9 +29,9 @@ GLIMPSES, _ENLARGED = 8, 240
 
 
 def saliency(policy: nn.Module, acted: TensorDict, camera: CameraConfig) -> NDArray[np.float32]:
-    """Return how much a decision depends on each place of the pictures it was made from.
+    """Return the saliency of a decision: its dependence on each place of its pictures.
 
-    The policy reads `pixels` and perhaps more and writes `logits` or `loc`; `acted` is what it read and wrote in one
+    The policy reads `pixels` and perhaps more and writes `logits` or `loc`; `acted` has its inputs and outputs in one
     step, [].
 
     A place is blurred, in all pictures of its camera, and the policy decides again: the score of a place is the square
@@ -62,7 +62,7 @@ def saliency(policy: nn.Module, acted: TensorDict, camera: CameraConfig) -> NDAr
 
 
 def _decision(out: TensorDict, acted: TensorDict) -> Tensor:
-    """Return what a decision is measured by, [..., 1 or 2]."""
+    """Return the values by which decisions are compared, [..., 1 or 2]."""
     if "loc" in out:
         return out["loc"]
     return out["logits"].log_softmax(-1)[..., acted["action"].item(), None]
@@ -108,9 +108,9 @@ def degrees(steering_deg: float) -> str:
 def glimpses(
     lap: Lap, acted: TensorDict, policy: nn.Module, actions: ActionSpace, camera: CameraConfig
 ) -> list[Glimpse]:
-    """Return what a policy saw and decided at places evenly spread over a lap.
+    """Return a policy's views and decisions at places evenly spread over a lap.
 
-    `acted` is what it read and wrote in the n steps of the lap, [n].
+    `acted` has its inputs and outputs in the n steps of the lap, [n].
     """
     strip = []
     steering_deg, speed_mps = actions.commands(acted["action"].numpy())

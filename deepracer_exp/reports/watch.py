@@ -1,4 +1,4 @@
-"""The command `watch`: a film of what a policy sees, where it looks, what it decides and where it drives."""
+"""The command `watch`: a film of a policy's view, saliency, decisions and driving."""
 
 import itertools
 from collections.abc import Iterator
@@ -33,19 +33,19 @@ from .sight import degrees, picture_of, saliency, under_heat
 
 WIDTH, HEIGHT = 1280, 720
 _EYE = (480, 360)
-"""Room for what the cameras see, and as much below it for where the policy looks."""
+"""Space for the camera pictures, and as much below it for their saliency."""
 _PAGE, _RULE, _INK, _FAINT, _CHOSEN, _BAR = "#14171a", "#343a42", "#f2f4f6", "#98a1ac", "#f5a623", "#5b87b8"
 _RAY = (255, 255, 255, 80)
 _DARK = 80
-"""Brightest of red, green and blue below which something is drawn lighter than it is."""
+"""Value of the brightest channel below which a colour is drawn lighter."""
 _BOARD_HEIGHT, _ACTIONS_HEIGHT = 84, 216
 _FINER = 2
 
 
 class Frames:
-    """Draws the frames of a lap: the car moves in each, what it saw and decided changes with its steps.
+    """Draws the frames of a lap: the car moves in each, its view and decisions change with its steps.
 
-    On the left what the cameras see, enlarged without smoothing, and below it the same under its saliency, each frame
+    On the left the camera pictures, enlarged without smoothing, and below it the same under its saliency, each frame
     scaled to its own highest value; on the right the view from above, with the rays of a LIDAR that hit something, and
     what the policy decides. Without a camera the right side is as wide as the frame.
     """
@@ -59,7 +59,7 @@ class Frames:
         observation: ObservationConfig,
         car: CarConfig,
     ) -> None:
-        """Draw what stays the same; `acted` is what the policy read and wrote in the n steps of the lap, [n]."""
+        """Draw the static parts; `acted` has the policy's inputs and outputs in the n steps of the lap, [n]."""
         self._shown, self._step = in_frames(lap, car.control_hz)
         self._acted, self._policy, self._camera = acted, policy, observation.camera
         self._left = 0 if self._camera is None else _EYE[0]

@@ -1,6 +1,6 @@
 """The process in which a reward function is called as deepracer-on-aws' validator calls it; see `aws_dry_run`.
 
-It imports little itself: a call is not seen to load what is loaded already.
+It imports little itself, because a call's import of a loaded module is invisible.
 """
 
 import inspect
@@ -24,14 +24,14 @@ _TRACED = 10.0
 
 
 def _main() -> None:
-    """Read from stdin what to call, and write a line of JSON to stdout after each step: its name and result.
+    """Read the calls from stdin, and write a line of JSON to stdout after each step: its name and result.
 
-    The steps are `started`, `load`, `signature`, each situation and `imports`; the result is what is wrong, or null.
-    The process is killed in a step that takes more than its CPU time, whatever the function catches.
+    The steps are `started`, `load`, `signature`, each situation and `imports`; the result is the error, or null. The
+    process is killed in a step that takes more than its CPU time, whatever the function catches.
     """
     request = json.load(sys.stdin)
     output = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # what the function writes is no result
+    os.dup2(2, 1)  # output of the function is not a result
 
     def answer(step: str, result: object = None) -> None:
         output.write(json.dumps([step, result]) + "\n")
@@ -63,7 +63,7 @@ class _Module:
         self._namespace: dict[str, Any] = {"__name__": "reward_function", "print": _format}
 
     def load(self) -> str | None:
-        """Run the module's text; return what is wrong with it, if anything is."""
+        """Run the module's text; return its error, if any."""
         _limit(self._limit_s)
         try:
             run_module(self._code, self._namespace)
@@ -82,7 +82,7 @@ class _Module:
         return None if len(signature.parameters) == 1 else str(signature)
 
     def call(self, params: dict[str, Any]) -> str | None:
-        """Run the module again and call the function; return what is wrong with the answer, if anything is."""
+        """Run the module again and call the function; return the error of the answer, if any."""
         _limit(self._limit_s)
         try:
             reward = self._run(params)
@@ -114,7 +114,7 @@ class _Module:
 
 
 def _limit(cpu_s: float) -> None:
-    """Have the kernel kill this process after so much CPU time from now (SIGPROF)."""
+    """Have the kernel kill this process after an amount of CPU time from now (SIGPROF)."""
     signal.setitimer(signal.ITIMER_PROF, cpu_s)
 
 
@@ -138,7 +138,7 @@ def _what_happened(error: BaseException, path: str) -> str:
 
 
 def _format(*values: object, **_: object) -> None:
-    """Stand in for `print`: what is printed must be printable there, too."""
+    """Stand in for `print`: printed values must be printable there, too."""
     for value in values:
         str(value)
 

@@ -1,4 +1,4 @@
-"""Call a reward function as deepracer-on-aws' validator does, and say what the validator would refuse."""
+"""Call a reward function as deepracer-on-aws' validator does, and return its objections."""
 
 import json
 import math
@@ -19,7 +19,7 @@ _MODULE = "deepracer_exp.validation.aws_calls"
 _LIMIT_S = 5.0
 """CPU seconds of a call."""
 _LONGEST_S = 120.0
-"""Seconds until a function is given up that waits without computing."""
+"""Time limit of a function that waits without computing."""
 _OBJECTS = 6
 
 
@@ -53,7 +53,7 @@ def dry_run_findings(source: RewardSource, track: Track) -> list[AwsFinding]:
 
 
 def _answers(source: RewardSource, situations: dict[str, dict[str, Any]]) -> tuple[dict[str, Any], str]:
-    """Return the result of each step of `aws_calls` that it came to, and how the process ended."""
+    """Return the result of each finished step of `aws_calls`, and the ending of the process."""
     request = {
         "path": source.path,
         "text": source_with_constants(source),

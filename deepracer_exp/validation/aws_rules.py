@@ -11,10 +11,10 @@ import pycodestyle
 from pyflakes.checker import Checker as Flakes
 
 Rule = Literal["documented", "validator", "style"]
-"""Whose rule it is.
+"""The source of the rule.
 
 - documented: AWS's developer guide has it, and the validator of deepracer-on-aws checks it.
-- validator: only that validator has it, as far as anybody outside AWS knows.
+- validator: only that validator has it, as far as is publicly known.
 - style: flake8, which that validator runs. The AWS console trained functions with such findings (E302, F401).
 """
 
@@ -68,8 +68,8 @@ _NOT_READ = (
 def text_findings(text: str) -> list[AwsFinding]:
     """Return the reasons, by line, why deepracer-on-aws would refuse the text of a reward function.
 
-    The rules are those of its source/libs/reward-function-validation. The text must be valid Python. What that
-    validator finds by calling the function is in `aws_dry_run`.
+    The rules are those of its source/libs/reward-function-validation. The text must be valid Python. Its findings by
+    calling the function are in `aws_dry_run`.
     """
     findings: list[AwsFinding] = []
     if len(text) > LONGEST:
@@ -115,13 +115,13 @@ def late_imports(text: str, lines: Collection[int], loaded: Sequence[str]) -> li
                     name is None and isinstance(function, ast.Attribute) and function.attr in methods
                 ):
                     by_numpy.append(AwsFinding(node.lineno, f"{_shortened(function)} {_BY_NUMPY}"))
-    if loaded and not late:  # the last one is what was asked for, those before it are what that one imports
+    if loaded and not late:  # the last one was requested, those before it are its own imports
         late.append(AwsFinding(0, f"{loaded[-1]} {_LATE}"))
     return late + by_numpy
 
 
 def _imported_names(tree: ast.Module) -> dict[str, str]:
-    """Return what each imported name stands for, such as numpy for np and numpy.mean for mean."""
+    """Return the full name of each imported name, such as numpy for np and numpy.mean for mean."""
     names: dict[str, str] = {}
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -153,7 +153,7 @@ def _calls(tree: ast.Module) -> Iterator[AwsFinding]:
 def _dotted_names(node: ast.AST) -> Iterator[tuple[ast.expr, str | None]]:
     """Yield each chain of calls and attributes with its name (`a(x).b`: a.b); None if it does not begin with a name.
 
-    As the validator does it: keyword arguments, and what else a chain begins with, are not looked into.
+    As the validator does it: keyword arguments, and other beginnings of a chain, are not searched.
     """
     if not isinstance(node, ast.Call | ast.Attribute):
         for child in ast.iter_child_nodes(node):

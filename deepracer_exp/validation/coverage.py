@@ -1,4 +1,4 @@
-"""Which lines of a reward function were executed, and which statements never are."""
+"""Coverage of a reward function: executed lines, and statements never reached."""
 
 import ast
 import sys
@@ -54,7 +54,7 @@ def never_executed(text: str, lines: set[int]) -> list[tuple[int, int]]:
     for function in ast.walk(ast.parse(text)):
         if isinstance(function, ast.FunctionDef):
             body = range(function.body[0].lineno, (function.end_lineno or 0) + 1)
-            spans += [] if lines.isdisjoint(body) else _missed(function.body, lines)
+            spans += [] if lines.isdisjoint(body) else _unexecuted(function.body, lines)
     missed: list[tuple[int, int]] = []
     for first, last in sorted(spans):  # functions in classes and in functions are walked last
         if missed and missed[-1][1] >= first - 1:
@@ -64,7 +64,7 @@ def never_executed(text: str, lines: set[int]) -> list[tuple[int, int]]:
     return missed
 
 
-def _missed(body: list[ast.stmt], lines: set[int]) -> Iterator[tuple[int, int]]:
+def _unexecuted(body: list[ast.stmt], lines: set[int]) -> Iterator[tuple[int, int]]:
     for statement in body:
         first, last = statement.lineno, statement.end_lineno or statement.lineno
         if lines.isdisjoint(range(first, last + 1)):
@@ -72,9 +72,9 @@ def _missed(body: list[ast.stmt], lines: set[int]) -> Iterator[tuple[int, int]]:
                 yield first, last
         elif not isinstance(statement, _FUNCTIONS):
             for block in ("body", "orelse", "finalbody"):
-                yield from _missed(getattr(statement, block, []), lines)
+                yield from _unexecuted(getattr(statement, block, []), lines)
             for case in getattr(statement, "cases", []):
-                yield from _missed(case.body, lines)
+                yield from _unexecuted(case.body, lines)
 
 
 def _has_no_line(statement: ast.stmt) -> bool:

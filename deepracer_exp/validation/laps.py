@@ -32,14 +32,14 @@ _UNDERSTEER = 1.5
 _BRAKING_MPS2 = 0.7
 _LOOK_M = np.linspace(0.0, 2.4, 9)
 _BEND_M, _BEND_RAD = 0.6, 0.4
-"""What is a bend to a driver on the outside of it: the road turns by about so much within this distance of a place."""
+"""Definition of a bend for a driver on its outside: the road turns by at least this angle within this distance."""
 _WEAVE_S = 0.27
 """Time for which a driver that weaves steers to one side; about that of a car's steering."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Driver:
-    """How a lap is driven."""
+    """The style of a lap."""
 
     lateral_mps2: float
     """Lateral acceleration in bends."""
@@ -48,9 +48,9 @@ class Driver:
     weave_deg: float = 0.0
     """Added to the steering angle, to the left and to the right in turn."""
     outwards: float = 0.0
-    """How far towards the outer border of each bend: 0 is the centre line, 1 the border."""
+    """Position towards the outer border of each bend: 0 is the centre line, 1 the border."""
     foresight: float = 1.0
-    """Share of the distance ahead in which bends are seen; 0: one brakes in them."""
+    """Share of the distance ahead in which bends are seen; 0: the driver brakes only in them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ def flawed_laps(setup: RaceSetup, good: DrivenLap) -> dict[str, DrivenLap]:
     flaws = {
         "zig-zag": [driver for deg in (20.0, 14.0, 8.0) for driver in laps([1.0, 0.8], weave_deg=deg)],
         "wide": [driver for share in (0.6, 0.4) for driver in laps([1.0, 0.8, 0.6], outwards=share)],
-        # Who brakes late has to take the bend slower.
+        # A driver that brakes late has to take the bend slower.
         "late braking": [
             driver for seen in (0.0, 0.3) for driver in laps([0.7, 0.5, 0.3, 0.15], foresight=seen)
         ],
@@ -179,7 +179,7 @@ def _bend_speed(setup: RaceSetup, now: Measures, drivers: Sequence[Driver]) -> F
 
 
 def _turn_rad(track: Track, ndist: Floats, around_m: float) -> Floats:
-    """Return by how much the centre line turns to the left from so far behind a place to so far ahead of it."""
+    """Return the centre line's turn to the left between a distance behind a place and a distance ahead of it."""
     behind, ahead = (track.start_pose(ndist + side * around_m / track.length_m).yaw_rad for side in (-1, 1))
     turn_rad: Floats = np.mod(ahead - behind + np.pi, 2 * np.pi) - np.pi
     return turn_rad

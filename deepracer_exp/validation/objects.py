@@ -1,4 +1,4 @@
-"""Boxes and bots for the validation of a reward function: where they stand, and params about them."""
+"""Boxes and bots for the validation of a reward function: their places and params."""
 
 from dataclasses import replace
 from typing import Literal
@@ -31,13 +31,13 @@ EXAMPLE = replace(
     ),
     bots=replace(ALONE.bots, number=1),
 )
-"""The others for a reward function that reads of them, where the race has none."""
+"""The others for a reward function that reads their params, where the race has none."""
 _APART_M = 0.6
 """Along the lap, between others that are out of the way."""
 
 
 def with_others(setup: RaceSetup) -> RaceSetup:
-    """Return the race with others where it has some or its reward function reads of them; a rival counts as a bot."""
+    """Return the race with others if it has some or its reward function reads their params; a rival counts as a bot."""
     race = setup.others
     if race is not None and race.rivals is not None:
         race = replace(race, bots=replace(race.bots, number=1), rivals=None)
@@ -48,7 +48,7 @@ def with_others(setup: RaceSetup) -> RaceSetup:
 
 
 def first_placement(setup: RaceSetup) -> Placement:
-    """Return where the others of a race stand in the first episode of its first car."""
+    """Return the placement of a race's others in the first episode of its first car."""
     assert setup.others is not None
     episode = np.zeros(1, np.int64)
     seeds = episode_seeds(CarStreams(setup.seed, [0], Purpose.OTHERS).keys, episode)
@@ -132,4 +132,4 @@ QUIRKS = {
     "objects_speed": "documented as 0 for boxes, it is the bots' speed for all, also while they stand",
     "object_in_camera": "documented for the next object, it is that of the one before it, and hardly ever true",
 }
-"""Params that the service gives otherwise than its documentation says."""
+"""Params in which the service deviates from its documentation."""

@@ -15,7 +15,7 @@ from .reward_map import RewardGrid
 from .situations import Situations, near_the_start, quirky, sample, situations
 
 _QUIRKY = 150
-"""Situations in which the service's mistakes are compared with what is documented, at three places of the others."""
+"""Situations in which the service's params are compared with the documented ones, at three places of the others."""
 _HELD = 15
 """Steps without moving after which the service ends the episode."""
 _FASTER = 1.1
@@ -142,7 +142,7 @@ def slow_laps_return_as_much(laps: Sequence[LapReturn], discount: float) -> Iter
         return
 
     def gain(slow: LapReturn) -> float:
-        """Return how much the return grows, relative, per relative saving of time."""
+        """Return the relative growth of the return per relative saving of time."""
         scale = max(abs(slow.total), abs(fast.total), 1e-9)
         return (fast.total - slow.total) / scale / (1 - fast.time_s / slow.time_s)
 
@@ -170,7 +170,7 @@ def slow_laps_return_as_much(laps: Sequence[LapReturn], discount: float) -> Iter
 def batch_differs(setup: RaceSetup, n: int) -> Iterator[str]:
     """Warn if the module's `reward_batch`, which trainings use, differs from its `reward_function` in n situations.
 
-    `reward_function` gets the step before each of them first: it may remember what `reward_batch` is given.
+    `reward_function` gets the step before each of them first: it may remember params that `reward_batch` gets.
 
     Raises:
         BadInput, RewardFailed: `reward_batch` cannot be used.
@@ -189,7 +189,7 @@ def batch_differs(setup: RaceSetup, n: int) -> Iterator[str]:
 
 
 def mistakes_with_objects(setup: RaceSetup) -> list[str]:
-    """Return warnings of params about boxes and bots that are taken for what they are not."""
+    """Warn of misread params about boxes and bots."""
     text = setup.reward.text
     pairs = [tuple(float(Probe(setup).rewards(now)[0]) for now in pair) for pair in near_the_start(setup)]
     near_start, elsewhere = zip(*pairs, strict=True)

@@ -36,7 +36,7 @@ class Probe:
         start: the answer at the start.
         calls: number of calls made since.
         failures: error messages and the params that caused them, in the order of these calls.
-        without_line: the error messages of all calls that name no line, because of what the function returned.
+        without_line: the error messages of all calls without a line, which a bad return value causes.
         hangs: a call exceeded the time limit; every later call counts as failed without being made.
 
     Raises:
@@ -90,7 +90,7 @@ class Probe:
                 return
 
     def _answer(self, answer: float | Failure) -> Answer:
-        """Count a call, and keep why it failed."""
+        """Count a call, and keep the reason of its failure."""
         self.calls += 1
         if not isinstance(answer, Failure):
             return Answer(answer)

@@ -1,4 +1,4 @@
-"""The short training of `validate trial=60s`, and whether it improves anything."""
+"""The short training of `validate trial=60s`, and its improvement."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,7 +15,7 @@ _FEWEST = 6
 
 
 def train_shortly(err: Console, plan: TrainPlan) -> list[str]:
-    """Train, and return lines that say where and whether anything improves.
+    """Train, and return lines with the run and the improvement of its metrics.
 
     Raises:
         RunFailed: the training failed.

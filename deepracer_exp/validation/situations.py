@@ -82,7 +82,7 @@ def poses(
     *,
     lateness: ArrayLike = 1.0,
 ) -> Poses:
-    """Return poses, with the number of steps it takes to get there; the arguments are broadcast together.
+    """Return poses, with the number of steps to get there; the arguments are broadcast together.
 
     `lateness` is the number of steps taken so far, relative to driving at the commanded speed all the way.
     """
@@ -140,7 +140,7 @@ def situations(
 
 
 OFF_ROAD_M = 0.5
-"""Sampled distance beyond the border; an episode ends there."""
+"""Largest sampled distance beyond the border; an episode ends there."""
 
 
 @dataclass(frozen=True)
@@ -151,9 +151,9 @@ class NamedSituation:
     setup: RaceSetup
     """The race in which it is."""
     now: Situations
-    """One situation."""
+    """The situation."""
     before: Situations
-    """One step earlier."""
+    """The situation one step earlier."""
 
 
 def middle_speed_mps(setup: RaceSetup) -> float:

@@ -126,13 +126,13 @@ class Check:
     laps: list[LapReturn] = field(default_factory=list)
     """Returns of driven laps, slowest first; none where the function is too slow or constant."""
     flawed: dict[str, LapReturn] = field(default_factory=dict)
-    """Returns of laps like the fastest of these, by the flaw that each of them has."""
+    """Returns of laps like the fastest of these, by their flaw."""
     grid: RewardGrid | None = None
     """None: not sampled, because a call takes too long."""
 
 
 def read(experiment: Experiment, files: RaceFiles | None = None) -> Check:
-    """Read an experiment's files, unless they were read, and find what AWS would refuse in its reward function.
+    """Read an experiment's files, unless they were read, and find AWS's objections to its reward function.
 
     Raises:
         BadInput: a file cannot be used; the reward is not valid Python or lacks a one-argument `reward_function`;
@@ -183,7 +183,7 @@ def try_named_situations(check: Check) -> None:
 
 
 def _failures_from_step_1(check: Check) -> set[str]:
-    """Return what fails in the named situations if `steps` is 1 in the first call of an episode."""
+    """Return the failures in the named situations if `steps` is 1 in the first call of an episode."""
     setup = check.setup
     cases = named_situations(setup, check.against)
     answers = [Probe(setup, 1).start, *(_act(Probe(case.setup, 1), case) for case in cases)]
@@ -345,7 +345,7 @@ def _line(out: Console, text: str, style: str | None = None) -> None:
 
 
 def _print_aws(out: Console, findings: list[AwsFinding]) -> None:
-    """Print what deepracer-on-aws would refuse, style apart, and what the documentation of the AWS console forbids."""
+    """Print the objections of deepracer-on-aws, without style, and those of the AWS console's documentation."""
     documented, validator, style = (
         [str(finding) for finding in findings if finding.rule == rule]
         for rule in ("documented", "validator", "style")
@@ -376,7 +376,7 @@ def _print_situations(out: Console, check: Check) -> None:
 
 
 def _print_laps(out: Console, check: Check) -> None:
-    """Print what laps of one line at several speeds return, and laps with a flaw."""
+    """Print the returns of laps of one line at several speeds, and of laps with a flaw."""
     if not check.laps:
         return
     table = Table("lap", "driven", box=None, pad_edge=False, padding=(0, 3, 0, 0), header_style="dim")
