@@ -203,7 +203,7 @@ def _keys(race: Race) -> list[str]:
 
 
 def _observed(race: Race, car: int | slice = slice(None)) -> Observed:
-    """Return what a policy sees, of one car or of all, (N, ...)."""
+    """Return the observation, of one car or of all, (N, ...)."""
     seen = {key: race.seen[key][car] for key in _keys(race)}
     return seen if len(seen) > 1 else seen.popitem()[1]
 

@@ -81,7 +81,7 @@ class _RivalRace(Race):
     """The race of the rivals.
 
     Attributes:
-        pace: speed of each over what its policy commands, (N,).
+        pace: factor on the speed that each rival's policy commands, (N,).
     """
 
     pace: Floats
@@ -140,7 +140,7 @@ class HeadToHead(Race):
     def drive_with(self, policies: Sequence[torch.nn.Module]) -> None:
         """Let policies drive the rivals, in each episode one of them, drawn uniformly.
 
-        They read what the rivals observe and write `action`. Episodes under way continue with the policy at the same
+        They read the rivals' observation and write `action`. Episodes under way continue with the policy at the same
         share of the list.
         """
         self._policies = policies
@@ -168,7 +168,7 @@ class HeadToHead(Race):
             self._share[car], pace = self._streams.stream(car, episode).random(2)
             self.rival.pace[car] = low + pace * (high - low)
         self._rival_percent[ids] = 0.0
-        self._meet(ids)
+        self._update_opponents(ids)
         for race in (self, self.rival):
             race._observe_started(ids)
 
@@ -177,9 +177,9 @@ class HeadToHead(Race):
         theirs = self._rivals_actions()
         self.rival._act(theirs)
         self._act(action)
-        self._meet(self._everyone)
-        self.rival._look(theirs)
-        self._look(action)
+        self._update_opponents(self._everyone)
+        self.rival._update_observation(theirs)
+        self._update_observation(action)
         if self._training is not None:
             self._put_lost_rivals_back(self._training.pause_s)
 
@@ -193,7 +193,7 @@ class HeadToHead(Race):
     ) -> None:
         """Put learners back, as `Race.put_back` does; while they are held, their rivals cannot run into them."""
         super().put_back(ids, percent, crashed, restarts, hold_s)
-        self._meet(ids)
+        self._update_opponents(ids)
 
     def put_rivals_back(
         self,
@@ -205,7 +205,7 @@ class HeadToHead(Race):
     ) -> None:
         """Put rivals back, as `Race.put_back` does."""
         self.rival.put_back(ids, percent, crashed, restarts, hold_s)
-        self._meet(ids)
+        self._update_opponents(ids)
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of everything the next steps of both cars depend on, except the rivals' policies."""
@@ -231,7 +231,7 @@ class HeadToHead(Race):
         assert setup.others.rivals is not None
         return setup.others.rivals
 
-    def _meet(self, ids: Ids) -> None:
+    def _update_opponents(self, ids: Ids) -> None:
         """Show the cars `ids` and their rivals to each other."""
         assert isinstance(self.rival.others, RaceRival)
         mine, theirs = self._batch.read(), self.rival._batch.read()

@@ -1,4 +1,4 @@
-"""Boxes and bots in a race: their placement, who is at fault in a crash, and what cars and reward functions see."""
+"""Boxes and bots in a race: their placement, who is at fault in a crash, and their features and params."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -149,7 +149,7 @@ class RaceOthers:
 
         Args:
             result: of the step without others.
-            hit: what each car has run into, or -1, (N,).
+            hit: index of the box or bot that each car has run into, or -1, (N,).
             time_s: since each episode's begin, (N,).
         """
         rules, others = self._rules, self.others
@@ -168,7 +168,7 @@ class RaceOthers:
         return result, has_hit & (status > STATUS_CODE["in_progress"])
 
     def put_back(self, ids: Ids, pose: Pose, percent: Floats, crashed: Bools, hold_s: Floats) -> Pose:
-        """Return where cars continue in the middle of their episodes, and hold them there.
+        """Return the poses at which cars continue in the middle of their episodes, and hold them there.
 
         `pose` and `percent` are where they would continue without others, `hold_s` is how long each is held there, (n,)
         each.
@@ -215,7 +215,7 @@ class RaceOthers:
         return np.asarray(next_ones(ids, theirs, here, reach))
 
     def boxes(self, ids: Ids) -> NDArray[np.float32]:
-        """Return what cameras and LIDARs see of the others of the cars `ids`, (n, K, 9); see `camera.take_pictures`."""
+        """Return the others of the cars `ids` for cameras and LIDARs, (n, K, 9); see `camera.take_pictures`."""
         poses = self.others.poses[ids].astype(np.float32)
         looks = np.broadcast_to(self._looks, (*poses.shape[:2], self._looks.shape[1]))
         return np.concatenate([poses, looks], axis=-1)

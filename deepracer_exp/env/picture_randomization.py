@@ -59,7 +59,7 @@ class PictureRandomization:
         tracks: Sequence[Track],
         others: int = 0,
     ) -> None:
-        """Take each car's ranges, its number over all processes and how many others there are around it.
+        """Take each car's ranges, its number over all processes and the number of others around it.
 
         Call `seed` and then `begin` next.
         """
@@ -152,7 +152,7 @@ class PictureRandomization:
         out[:, 2] += self._of("height_m", ids)
         out[:, 3] += np.radians(self._of("pitch_deg", ids))
         out[:, 4] /= self._of("field_of_view_scale", ids)
-        # Wide enough for what the corners show.
+        # Wide enough for the corners.
         out[:, 4] /= 1 + np.maximum(self._of("lens_k1", ids), 0)
         return out
 
@@ -188,7 +188,7 @@ class PictureRandomization:
             pictures = _distort(pictures, k1)
         dirt = self._of("dirt", ids)
         if dirt.any():
-            _soil(pictures, self._dirt[ids], dirt)
+            _darken_spots(pictures, self._dirt[ids], dirt)
         noise_start = (self._noise_start[ids] + _NEXT_PICTURE * steps) % _NOISE_NUMBERS
         blur, noise = self._of("blur", ids), 255 * self._of("pixel_noise", ids)
         return _disturb(pictures, self._spot[ids], blur, noise, self._noise, noise_start)
@@ -261,7 +261,7 @@ def _distort(pictures, k1s):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
-def _soil(pictures, spots, depths):  # type: ignore[no-untyped-def]
+def _darken_spots(pictures, spots, depths):  # type: ignore[no-untyped-def]
     """Darken spots of the pictures."""
     count, channels, height, width = pictures.shape
     across = np.empty(width, np.float32)

@@ -179,7 +179,7 @@ class Pictures:
         colors: NDArray[np.float32],
         boxes: NDArray[np.float32] | None,
     ) -> Pixels:
-        """Return what cars see through a lens, (n, channels, height, width): arguments as for `take_pictures`."""
+        """Return the cars' pictures through a lens, (n, channels, height, width): arguments as for `take_pictures`."""
         is_real = self._jpeg_quality[ids] != AS_SIMULATED
         if is_real.any() and not is_real.all():
             out = np.empty((len(ids), colors.shape[-1], lens.height, lens.width), np.uint8)

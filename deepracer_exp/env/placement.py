@@ -50,8 +50,8 @@ _COLUMNS: tuple[tuple[str, pa.DataType, str], ...] = (
         pa.list_(pa.float32()),
         "m, origin of the rival at each of its rows; empty without a rival",
     ),
-    ("rival_y_m", pa.list_(pa.float32()), "m, y of that origin"),
-    ("rival_yaw_deg", pa.list_(pa.float32()), "degrees, yaw of that rival"),
+    ("rival_y_m", pa.list_(pa.float32()), "m, of the same"),
+    ("rival_yaw_deg", pa.list_(pa.float32()), "degrees, of the same"),
 )
 SCHEMA = pa.schema([pa.field(name, kind, metadata={"unit": unit}) for name, kind, unit in _COLUMNS])
 """One row for each episode that drove in an iteration."""
@@ -225,7 +225,7 @@ def rebuild_poses(
     episode: NDArray[np.intp],
     step: NDArray[np.int64],
 ) -> tuple[Floats, Floats]:
-    """Return where the others were at rows of a trace: poses (n, K, 3) and distances along the lap in metres, (n, K).
+    """Return the others at rows of a trace: poses (n, K, 3) and distances along the lap in metres, (n, K).
 
     Bots are driven again by the code that drove them; a rival is where it was recorded, or NaN. A row has the pose of
     the car at a control step and, of the others, the poses of the same time; crashes and params of that step used the

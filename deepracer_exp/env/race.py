@@ -293,7 +293,7 @@ class Race:
             NonFinite: an action, a car's state or an observation is NaN or infinite.
         """
         self._act(action)
-        self._look(action)
+        self._update_observation(action)
 
     def _act(self, action: np.ndarray) -> None:
         """Apply the rules, compute the rewards and move the cars; arguments and errors as for `step`."""
@@ -321,7 +321,7 @@ class Race:
         """Convert actions to steering in degrees and speed in m/s, (N,) each."""
         return self.setup.actions.commands(action)
 
-    def _look(self, action: np.ndarray) -> None:
+    def _update_observation(self, action: np.ndarray) -> None:
         """Compute the observation after the action; errors as for `step`."""
         self._observe()
         self._require_finite("observation", self.observation, self.feature_names, action)

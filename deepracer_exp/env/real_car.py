@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from .setup import RaceSetup
 
 CAR_PICTURE = (160, 120)
-"""Width and height of what the car's software shows a model."""
+"""Width and height of the pictures that the car's software passes to a model."""
 FRAME_SCALE = 4
 """Width and height of the camera's frames over those of the picture."""
 AS_SIMULATED, UNCOMPRESSED = -1, 0

@@ -38,12 +38,12 @@ class _OtherCar(Others):
         """Do nothing: a car that was run into drives on."""
 
     def hit(self, x_m: Floats, y_m: Floats, yaw_rad: Floats) -> NDArray[np.int64]:
-        """Return what each car has run into, as `Others.hit` does."""
+        """Return the index of the object that each car has run into, as `Others.hit` does."""
         hit = super().hit(x_m, y_m, yaw_rad)
         return np.where(self.untouchable & (hit == len(self.is_bot) - 1), -1, hit)
 
     def speeds_mps(self, ids: Ids, time_s: Floats) -> Floats:
-        """Return how fast the others of the cars `ids` drive, (n, K)."""
+        """Return the speeds of the others of the cars `ids`, m/s, (n, K)."""
         return self.speed_mps[ids, None] * self.is_bot
 
     def state_dict(self) -> dict[str, Any]:
@@ -83,7 +83,7 @@ class RaceRival(RaceOthers):
         return np.asarray(self._held_until > self._rules.steps)
 
     def begin(self, ids: Ids, pose: Pose, evaluated: bool) -> Pose:
-        """Return where the cars start: one at its place in the outer lane, the other behind it in the inner one.
+        """Return the starts of the cars: one at its place in the outer lane, the other behind it in the inner one.
 
         The finish line of both is the place of the car in front. Who starts there is drawn, and in an evaluation
         alternates from trial to trial. A car that would start near a box starts in the other lane; this may move both

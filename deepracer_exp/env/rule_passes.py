@@ -110,7 +110,7 @@ def wheels_of_car(road, line, pose, wheels_m, on):  # type: ignore[no-untyped-de
 
 
 class Episodes(NamedTuple):
-    """Where N cars are in their episodes: arrays with a row per car, changed in place; see `RaceRules`."""
+    """Progress of N cars in their episodes: arrays with a row per car, changed in place; see `RaceRules`."""
 
     cars: np.ndarray
     """Numbers of the cars over all processes."""
@@ -132,7 +132,7 @@ class Episodes(NamedTuple):
 
 
 class Starts(NamedTuple):
-    """Where episodes begin."""
+    """Starts of the episodes."""
 
     offset: float
     """Start of the first episode, and what each after it adds: shares of the lap."""
@@ -183,7 +183,7 @@ class Rules(NamedTuple):
 
 
 class Places(NamedTuple):
-    """Where cars are: the arrays of `Measures` that the rules need."""
+    """Positions of cars: the arrays of `Measures` that the rules need."""
 
     x_m: np.ndarray
     y_m: np.ndarray

@@ -224,7 +224,7 @@ class RaceRules:
     def reset(
         self, ids: Ids | None = None, start_ndist: np.ndarray | None = None, course: np.ndarray | None = None
     ) -> Pose:
-        """Begin an episode with each of the cars and return where its chassis origin starts.
+        """Begin an episode with each of the cars and return the start poses of the chassis origins.
 
         Args:
             ids: indices of the cars, None: all of them.

@@ -40,7 +40,7 @@ class DeepRacerVecEnv(VecEnv):
         self._first_seed: int | None = None
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Have the next reset start over from a seed, or from a random one; return the seeds, one a car."""
+        """Seed the next reset, or seed it at random; return the seeds, one per car."""
         seeds: Sequence[int | None] = super().seed(seed)
         self._first_seed = seeds[0]
         return seeds
@@ -52,7 +52,7 @@ class DeepRacerVecEnv(VecEnv):
         return observation
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Take the actions of the next step."""
+        """Store the actions of the next step."""
         self._actions = actions
 
     def step_wait(self) -> tuple[Observed, NDArray[Any], NDArray[Any], list[dict[str, Any]]]:

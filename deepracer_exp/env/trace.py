@@ -82,10 +82,10 @@ space, and `episode_return` the sum of the episode's rewards up to here."""
 PACKED = {name: place for place, name in enumerate(PACKED_COLUMNS)}
 """Column number of each packed column."""
 OTHERS_PACKED = ("own_episode", "bots_stopped")
-"""Columns after these among boxes and bots: the number of the episode among those of its car, and whether all bots
-stopped in this step because one had hit the car."""
+"""Further columns with boxes or bots: the episode's number among those of its car, and whether all bots stopped in this
+step because one had hit the car."""
 RIVAL_PACKED = ("rival_x", "rival_y", "rival_yaw")
-"""Columns after these in a race against a rival: x and y of its origin in metres, and its yaw in radians."""
+"""Further columns in a race against a rival: x and y of its origin in metres, and its yaw in radians."""
 SCHEMA = pa.schema([pa.field(name, kind, metadata={"unit": unit}) for name, kind, unit in _COLUMNS])
 
 

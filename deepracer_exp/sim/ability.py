@@ -20,13 +20,13 @@ _TIGHTEST_PER_M = 3.0
 
 
 def ability_of(car: CarConfig, low: Floats, high: Floats, floor_friction: float = 1.0) -> Ability:
-    """Drive cars with random commands within limits and return the most that any of them did.
+    """Drive cars with random commands within limits and return the extremes that they reached.
 
     `low` and `high` are limits of [speed_mps, steering_rad], (2,); `floor_friction` is a factor on the friction of the
     tyres.
 
-    Bends count with the mean speed over `WINDOW_M` on either side: for so long a car can turn faster than it could for
-    good, while it slides or its weight shifts.
+    Bends count with the mean speed over `WINDOW_M` on either side: for that long a car can turn faster than steadily,
+    while it slides or its weight shifts.
     """
     steps, random = int(_SECONDS * car.control_hz), np.random.default_rng(0)
     cars = CarBatch(car, _CARS, 1, floor_friction)
@@ -40,7 +40,7 @@ def ability_of(car: CarConfig, low: Floats, high: Floats, floor_friction: float 
         x_m[step], y_m[step], speed[step] = now.x_m, now.y_m, np.hypot(now.speed_mps, now.lateral_mps)
         for k in range(2):
             new = left[:, k] <= 0
-            # As often as not a limit: the most extreme driving is between the extremes.
+            # Most commands are limits: the most extreme driving mixes them with others.
             extreme = np.where(random.random(_CARS) < 0.5, low[k], high[k])
             drawn = np.where(random.random(_CARS) < 0.6, extreme, random.uniform(low[k], high[k], _CARS))
             command[new, k] = drawn[new]
@@ -64,7 +64,7 @@ def ability_of(car: CarConfig, low: Floats, high: Floats, floor_friction: float 
         curvature, mean = _bends(x_m[:, n], y_m[:, n], car.control_period_s)
         # A bin's speed is that of its tight end.
         np.maximum.at(fastest, np.minimum(np.searchsorted(edges, curvature), _BINS), mean)
-    # What is possible in a bend is possible in a wider one.
+    # A speed that is possible in a bend is possible in a wider one.
     speeds = np.maximum.accumulate(fastest[::-1])
     # Bends tighter than any that was driven.
     speeds[speeds == 0.0] = speeds[speeds > 0.0].min()

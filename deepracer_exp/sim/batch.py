@@ -131,7 +131,7 @@ class CarBatch:
                 self._batch.step()
             except mujoco.batch.SimulationError as error:
                 raise RunFailed(f"car {int(error.ids[0])}: {error}") from error
-        _refuse("physics state", _first_lost(self._moving))
+        _refuse("physics state", _first_non_finite(self._moving))
 
     def read(self, ids: Ids | None = None) -> CarState:
         """Return position and motion of the cars `ids`, (n,) each; None: of all."""
@@ -193,7 +193,7 @@ def _refuse(what: str, car: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _first_lost(values):  # type: ignore[no-untyped-def]
+def _first_non_finite(values):  # type: ignore[no-untyped-def]
     """Return the first row of which a number is not finite, -1 if there is none."""
     for car in range(len(values)):
         for value in values[car]:
@@ -231,7 +231,7 @@ def _place(ids, pose, com_m, rest, rows, qpos):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _read(ids, qpos, qvel, com_m):  # type: ignore[no-untyped-def]
-    """Return where the chassis origins of the cars `ids` are, their headings' cosines and sines, and their motion."""
+    """Return chassis origins of the cars `ids`, cosines and sines of their headings, and their motion."""
     count = len(ids)
     x_m, y_m, cosines, sines = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
     ahead_mps, left_mps, rate_radps = np.empty(count), np.empty(count), np.empty(count)

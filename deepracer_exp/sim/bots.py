@@ -1,4 +1,4 @@
-"""How the service's bots drive: along the lanes at a constant speed, with changes of lanes."""
+"""The driving of the service's bots: along the lanes at a constant speed, with changes of lanes."""
 
 import math
 from typing import NamedTuple
@@ -20,7 +20,7 @@ def _between(rows, lane, cell, part, column):  # type: ignore[no-untyped-def]
 
 
 class Manner(NamedTuple):
-    """How bots drive; see `conf/race`."""
+    """Settings of the bots' driving; see `conf/race`."""
 
     speed_mps: float
     pause_s: float

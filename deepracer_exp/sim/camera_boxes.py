@@ -129,7 +129,7 @@ def _find(boxes, camera, width, visible):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
 def _choose(visible, n_left, eye):  # type: ignore[no-untyped-def]
-    """Return the place of the first box that hides none of the others; if each of them hides another, the farthest."""
+    """Return the first box that hides no other; if each of them hides another, the farthest."""
     _, corners, columns, distance, left = visible
     for candidate in range(n_left):
         box, hides = left[candidate], False
@@ -257,6 +257,6 @@ def _all_outside(corners, side, others):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, inline="always")
 def _outside(corners, side, x, y):  # type: ignore[no-untyped-def]
-    """Return how far a point is beyond the line of a side, times the side's length."""
+    """Return a point's distance beyond the line of a side, times the side's length."""
     begin, end = corners[side], corners[(side + 1) % 4]
     return (end[1] - begin[1]) * (x - begin[0]) - (end[0] - begin[0]) * (y - begin[1])

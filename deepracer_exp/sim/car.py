@@ -59,7 +59,7 @@ def build_spec(car: CarConfig, visual: bool = False) -> mujoco.MjSpec:
 
 
 def _add_visuals(spec: mujoco.MjSpec, chassis: mujoco.MjsBody, car: CarConfig) -> None:
-    """Add what the renderer shows: floor, shell, cockpit, camera, tyres and spokes, and a light."""
+    """Add the visible parts: floor, shell, cockpit, camera, tyres and spokes, and a light."""
     spec.worldbody.add_geom(
         name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=0, conaffinity=0
     )

@@ -1,4 +1,4 @@
-"""Which of the others a car runs into: rectangles against rectangles, as on the service."""
+"""Crashes of cars into others: rectangles against rectangles, as on the service."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""A pinhole camera on a car: where its eye is, and which way it looks."""
+"""A pinhole camera on a car: the place of its eye and its direction."""
 
 from dataclasses import dataclass
 

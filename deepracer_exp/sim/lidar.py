@@ -33,7 +33,8 @@ def scan(poses: NDArray[np.float64], segments_m: NDArray[np.float64]) -> NDArray
 
     Args:
         poses: x and y in metres and direction in radians of each sensor, (N, 3).
-        segments_m: ends ax, ay, bx, by of what each sensor sees, (N, segments, 4); NaN where there is nothing.
+        segments_m: ends ax, ay, bx, by of the segments around each sensor, (N, segments, 4); NaN where there is
+            nothing.
     """
     out = np.empty((len(poses), RAYS))
     _scan(np.ascontiguousarray(poses), segments_m, np.cos(ANGLES_RAD), np.sin(ANGLES_RAD), out)

@@ -1,4 +1,4 @@
-"""Which of the others are next to a car along the lap, and what a policy is shown of them."""
+"""The others next to a car along the lap, and their features for a policy."""
 
 from typing import NamedTuple
 
@@ -7,7 +7,7 @@ import numpy as np
 from deepracer_exp.compiled import njit
 
 SHOWN = 4
-"""Numbers that `next_ones` returns of each."""
+"""Number of features that `next_ones` returns of each."""
 
 
 @njit(cache=True, nogil=True)
@@ -44,20 +44,20 @@ class Around(NamedTuple):
     """The K others of each car."""
 
     distance_m: np.ndarray
-    """How far along the lap the others of all cars are, (N, K), as in `offset_m`."""
+    """Positions along the lap of the others of all cars, (N, K), as in `offset_m`."""
     offset_m: np.ndarray
     """How far to the left of the centre line they are."""
     is_bot: np.ndarray
     """Which of the others are cars, (K,)."""
     speeds_mps: np.ndarray
-    """Speeds of the others of the n cars that are asked for, (n, K)."""
+    """Speeds of the others of the n selected cars, (n, K)."""
 
 
 class Here(NamedTuple):
-    """Where n cars are: arrays with a row per car."""
+    """Positions of n cars: arrays with a row per car."""
 
     distance_m: np.ndarray
-    """How far along the lap the front points are."""
+    """Positions of the front points along the lap."""
     offset_m: np.ndarray
     """How far to the left of the centre line they are."""
     speed_mps: np.ndarray
@@ -68,20 +68,20 @@ class Here(NamedTuple):
 
 
 class Reach(NamedTuple):
-    """How many others are shown, and which."""
+    """Number and selection of the others."""
 
     number: int
     behind_m: float
-    """An other counts as ahead until it is so far behind."""
+    """An other counts as ahead until it is this far behind."""
     ahead_m: float
-    """Up to where others are shown."""
+    """Distance within which others are shown."""
     speed_scale_mps: float
-    """What closing speeds are divided by."""
+    """Divisor of closing speeds."""
 
 
 @njit(cache=True, nogil=True)
 def next_ones(ids, others, here, reach):  # type: ignore[no-untyped-def]
-    """Return what is shown of the next others of the cars `ids` in order along the lap, (n, number * SHOWN), float32.
+    """Return the features of the next others of the cars `ids` in order along the lap, (n, number * SHOWN), float32.
 
     Of each: how far ahead of the car's front it is over the reach; how far to the left of the car it is across the road
     over half the road's width, -2 to 2; the car's speed less its own over the scale; and whether it is a bot. One

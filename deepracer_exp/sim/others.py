@@ -1,7 +1,7 @@
-"""Boxes and bots around every car: where they are, step by step, and which of them a car runs into.
+"""Boxes and bots around every car: their places step by step, and crashes into them.
 
-They are no bodies of the physics: on the service nothing touches a bot, and a box is met by the crash rule before its
-body is (deepracer-simapp, markov/agent_ctrl/obstacles_agent_ctrl.py and bot_cars_agent_ctrl.py).
+They are not bodies of the physics: on the service nothing touches a bot, and a box's crash rule applies before its body
+is touched (deepracer-simapp, markov/agent_ctrl/obstacles_agent_ctrl.py and bot_cars_agent_ctrl.py).
 """
 
 import math
@@ -134,7 +134,7 @@ class Others:
     def pause(self, hit: NDArray[np.bool_], time_s: Floats) -> None:
         """Stop the bots of cars that one of them has hit, unless they stand still already.
 
-        `hit` says whose bots stop, `time_s` is the time since each episode's begin, (N,) each.
+        `hit` selects these cars, `time_s` is the time since each episode's begin, (N,) each.
         """
         pause_s = self._race.bots.pause_s
         ids = np.flatnonzero(hit & (time_s >= self.resumes_s - _ROUNDING_S))
@@ -154,7 +154,7 @@ class Others:
         return np.asarray(first_hit(x_m, y_m, yaw_rad, self.poses, self.half_m))
 
     def speeds_mps(self, ids: Ids, time_s: Floats) -> Floats:
-        """Return how fast the others of the cars `ids` move at a time since their episodes' begin, (n,), as (n, K)."""
+        """Return speeds in m/s of the others of the cars `ids`, (n, K), at times since their episodes' begin, (n,)."""
         moving = time_s >= self.resumes_s[ids] - _ROUNDING_S
         return self._going_mps * moving[:, None]
 
@@ -173,7 +173,7 @@ class Others:
 
 
 def check_room(race: RaceConfig, tracks: Sequence[tuple[str, Track]]) -> None:
-    """Refuse more boxes or bots than a track has room for.
+    """Refuse more boxes or bots than fit on a track.
 
     Raises:
         BadInput: a track is too short, or open, so that bots could not drive round it.

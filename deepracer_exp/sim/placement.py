@@ -1,7 +1,7 @@
-"""Where boxes and bots are when an episode begins, drawn for each car and episode as the service places them.
+"""Initial placement of boxes and bots, drawn for each car and episode as by the service.
 
-Their random numbers are hashes of a seed and a number, so that nothing but the seed has to be kept, and all cars are
-placed in one compiled pass (Steele and others, "Fast splittable pseudorandom number generators", 2014: SplitMix64).
+Their random numbers are hashes of a seed and a number, so that only the seed has to be kept, and all cars are placed in
+one compiled pass (Steele and others, "Fast splittable pseudorandom number generators", 2014: SplitMix64).
 """
 
 import numpy as np

@@ -167,7 +167,7 @@ def wall_material(
 
 
 def paved_area(track: Track, kerb_m: float = KERB_WIDTH_M) -> BaseGeometry:
-    """Return the road with what lines and kerbs lie outside its border, these up to the width `kerb_m`."""
+    """Return the road with the lines and kerbs outside its border, kerbs up to the width `kerb_m`."""
     if track.floor.lines_inside and track.floor.kerb_color is None:
         return track.road
     beyond = 0.0 if track.floor.lines_inside else LINE_WIDTH_M
@@ -175,7 +175,7 @@ def paved_area(track: Track, kerb_m: float = KERB_WIDTH_M) -> BaseGeometry:
 
 
 def box_corners(boxes: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return where boxes stand, counter-clockwise corners (..., 4, 2).
+    """Return the floor corners of boxes, counter-clockwise, (..., 4, 2).
 
     The boxes are as `camera.take_pictures` has them: x, y, yaw, length, width, ..., (..., 5 or more).
     """

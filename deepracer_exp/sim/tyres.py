@@ -122,7 +122,7 @@ def tyre_forces(car, drive, ahead_mps, left_mps, rate_radps, dt_s):  # type: ign
     """
     front_m, rear_m = car.axle_x_m[0] - car.com_x_m, car.com_x_m - car.axle_x_m[1]
     base_m = front_m + rear_m
-    # Load: at rest, plus what acceleration ahead and to the left shifts at the height of the centre of mass.
+    # Load: at rest, plus the shift by acceleration ahead and to the left at the height of the centre of mass.
     shifted_n = car.mass_kg * drive.ahead_mps2 * car.com_z_m / base_m
     tilted_n = 0.25 * car.mass_kg * drive.left_mps2 * car.com_z_m
     angle = drive.steering_rad + car.steering_trim_rad

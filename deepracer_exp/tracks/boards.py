@@ -1,4 +1,4 @@
-"""The official leaderboards of the service's time trials, and where a lap would stand on them.
+"""The official leaderboards of the service's time trials, and the rank of a lap on them.
 
 `boards.csv` has the boards since March 2020, when the service's commands were limited to 4 m/s as they are today. Times
 before that do not compare.
@@ -14,9 +14,9 @@ from deepracer_exp.config.custom_files import CARS
 
 FILE = Path(__file__).with_name("boards.csv")
 _VERSION_5_SINCE = "2022-07-21"
-"""Models raced on 3 July 2022 state simulation version 4, the first known ones that state version 5 are of this day."""
+"""Day of the first known models with simulation version 5; models raced on 3 July 2022 still state version 4."""
 _VERSION_4_SINCE = "2020-10"
-"""Models of August and September 2020 state version 3. When version 4 came after that is not known."""
+"""Models of August and September 2020 state version 3; the date of version 4 is not known."""
 _ORDER = {"TOTAL_TIME": "total of", "AVG_LAP_TIME": "average of", "BEST_LAP_TIME": "best of"}
 
 
@@ -56,11 +56,11 @@ class Board:
 
     @property
     def terms(self) -> str:
-        """Return what counted, in words."""
+        """Return the scoring in words."""
         return "best lap" if self.laps == 1 else f"{_ORDER[self.timing]} {self.laps} laps"
 
     def place(self, lap_s: float) -> str:
-        """Return where a time would stand, as far as the board's figures say, after ``it would``."""
+        """Return the rank of a time, as far as the board's figures determine it, to follow ``it would``."""
         if lap_s <= self.winner_s:
             return f"have won ({self.winner_s:.2f} s won)"
         if lap_s <= self.first_1_percent_s:
@@ -97,13 +97,13 @@ def boards_of(world: str) -> tuple[Board, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class Standing:
-    """The place of a policy's laps on a board, and how they differ from those of its racers."""
+    """The place of a policy's laps on a board, and their differences from the racers' laps."""
 
     board: Board
     lap_s: float
     """Mean of the complete laps, or the best of them where that counted and is known; penalties included."""
     is_best: bool
-    """Whether it is the best of them."""
+    """Whether the time is that of the best lap."""
     car: str
     """The car that drove."""
     sees: str
@@ -118,7 +118,7 @@ class Standing:
 
     @property
     def words(self) -> str:
-        """Return it as a sentence."""
+        """Return the place as a sentence."""
         board = self.board
         lap = f"a best lap of {self.lap_s:.2f} s" if self.is_best else f"{self.lap_s:.2f} s a lap"
         differs = f"driven with {self.car} from {self.sees}, the board's racers "
@@ -137,7 +137,7 @@ class Standing:
         return f"{board.board} ({board.racers:,} racers, {board.terms}): {place}; {differs}"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as JSON types."""
+        """Return the place as JSON types."""
         return {
             **vars(self.board),
             "board_car": self.board.car,
@@ -158,7 +158,7 @@ def standings(
     sees: str,
     off_track_penalty_s: float | None,
 ) -> list[Standing]:
-    """Return where laps would stand on each board of a world, driven in the order of its waypoints.
+    """Return the place of laps on each board of a world, driven in the order of its waypoints.
 
     Boards of the car's own time come first, and of these the one with most racers.
 
@@ -167,8 +167,8 @@ def standings(
         mean_lap_s: mean of the complete laps.
         best_lap_s: the fastest of them; None: not known, and the mean counts instead.
         car: name of the car.
-        sees: what the policy sees, such as `a camera` or `features`.
-        off_track_penalty_s: what it cost to leave the track; None: it ended the lap.
+        sees: the policy's sensors, such as `a camera` or `features`.
+        off_track_penalty_s: penalty for leaving the track; None: it ended the lap.
     """
     places = []
     for board in boards_of(world):
@@ -192,6 +192,6 @@ def standings(
 
 
 def what_it_sees(camera: object, lidar: object) -> str:
-    """Return what a policy sees in words, by whether its observation has a camera and a LIDAR."""
+    """Name a policy's sensors, by whether its observation has a camera and a LIDAR."""
     seen = [name for name, sensor in (("a camera", camera), ("a LIDAR", lidar)) if sensor is not None]
     return " and ".join(seen) or "features"

@@ -1,4 +1,4 @@
-"""The two lanes of courses: where boxes stand, where bots drive, and where cars are put back beside them."""
+"""The two lanes of courses, in which boxes stand and bots drive, and to which cars are put back."""
 
 import math
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ INNER, OUTER = 0, 1
 _CELL_M = 0.01
 """Length of a cell of a `Paths`: between its ends a straight line is less than 0.2 mm off a smooth spline."""
 _TIE_M, _NEARBY_M = 1e-3, 1.0
-"""Distances that count as equal, and how far along the lap the projection of a lane's point may be."""
+"""Distances that count as equal, and largest shift along the lap of the projection of a lane's point."""
 
 Floats = NDArray[np.float64]
 

@@ -1,8 +1,8 @@
-"""The least time in which a course can be driven, as a bound from below: a line, and the speed a car can have on it.
+"""A lower bound of the lap time on a course: a line, and the speed a car can have on it.
 
-What a car can do is an `Ability`: the speed it keeps at a curvature, and how fast it gains and loses speed on a
-straight. A real car has to steer into a bend and cannot do everything at once, so it takes longer on the same line. The
-line is the fastest one that a local search finds; that no other line is faster is not proved.
+The limits of a car are an `Ability`: the speed it keeps at a curvature, and how fast it gains and loses speed on a
+straight. A real car has to steer into a bend and cannot use all limits at once, so it takes longer on the same line.
+The line is the fastest one that a local search finds; that no other line is faster is not proved.
 """
 
 from typing import NamedTuple
@@ -17,17 +17,17 @@ from .track import Track
 Floats = NDArray[np.float64]
 
 WINDOW_M = 0.4
-"""Curvature is that of the circle through a point and those so far behind and ahead of it."""
+"""Curvature is that of the circle through a point and those at this distance behind and ahead of it."""
 _SAMPLE_M = 0.1
 _KNOT_M = 0.3
 """Distance of the places at which a line is moved."""
 _STRAIGHTNESS = (0.0, 1.0, 10.0, 100.0, 1000.0)
-"""How much curvature counts beside length in the lines to begin with."""
+"""Weights of curvature relative to length in the initial lines."""
 _ITERATIONS = 100
 
 
 class Ability(NamedTuple):
-    """What a car can do at most."""
+    """The limits of a car."""
 
     curvature_per_m: Floats
     """Falling, measured over `WINDOW_M`."""
@@ -62,7 +62,7 @@ def fastest_line(
     """
     road = _Road(track, reach_m, ability, start_ndist, short_m)
     lines = road.simple_lines() if driven is None else [road.offsets_of(driven)]
-    # Improving takes long; the two most promising lines are worth it.
+    # Improving takes long; only the two most promising lines are improved.
     promising = sorted(lines, key=road.time_s)[:2]
     improved = min((road.improved(offsets) for offsets in promising), key=lambda line: line[0])
     return improved[0], road.line(improved[1])
@@ -87,7 +87,7 @@ class _Road:
         inner, outer = (_between(line, places) for line in (track.inner, track.outer))
         self._middle, self._half = 0.5 * (outer + inner), 0.5 * (outer - inner)
         self._reach = 1.0 + reach_m / np.maximum(np.hypot(*self._half.T), 1e-6)
-        # What is imported from scipy here takes half a second, and few commands search a line.
+        # These imports from scipy take half a second, and few commands search a line.
         from scipy.interpolate import CubicSpline
 
         self._start = None if start_ndist is None else track.points_at(np.array([start_ndist]))[0]

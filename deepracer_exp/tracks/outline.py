@@ -1,4 +1,4 @@
-"""The outline of a track for whatever draws it, and its picture from above for films and environments."""
+"""The outline of a track for drawing, and its picture from above for films and environments."""
 
 from dataclasses import dataclass
 from itertools import chain

@@ -1,4 +1,4 @@
-"""Courses: centre line, borders, and where points lie between them; one course, or several as one batch."""
+"""Courses: centre line, borders, and positions relative to them; one course, or several as one batch."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -27,7 +27,7 @@ MOST_OFF = 0.05
 _GRID_M = 1e-6
 """Points of a course nearer to each other count as one when it is checked for crossings."""
 _FOLD_M = 0.1
-"""Length of a loop in a centre line up to which it is one of rounding; the world of 2019 has one of 4 mm."""
+"""Longest loop in a centre line that counts as rounding; the world of 2019 has one of 4 mm."""
 _FIRST = np.zeros(1, np.intp)
 
 TrackIndex = NDArray[np.intp]
@@ -120,7 +120,7 @@ class Track:
             name: World name.
             title: Title for display; the world name when missing.
             reversed: Drive against the order of the rows.
-            floor: What the road is made of.
+            floor: Grip, lines and colours of the track.
 
         Raises:
             BadInput: The rows do not form a course.
@@ -232,7 +232,7 @@ class Track:
         return self._alone.border_distances(points, center, _FIRST)
 
     def on_road(self, points: np.ndarray) -> np.ndarray:
-        """Return for points (m, 2) whether they are inside the road (bool)."""
+        """Return whether points (m, 2) are inside the road (bool)."""
         return self._alone.on_road(points, _FIRST)
 
     def points_at(self, ndist: np.ndarray) -> np.ndarray:
@@ -304,7 +304,7 @@ class Tracks:
         )
 
     def on_road(self, points: np.ndarray, track_index: TrackIndex) -> np.ndarray:
-        """Return for points (m, 2) whether they are inside the road of their course (bool)."""
+        """Return whether points (m, 2) are inside the road of their course (bool)."""
         return segments.on_road(self.road, track_index, _points(points))
 
     def points_at(self, ndist: np.ndarray, track_index: TrackIndex) -> np.ndarray:
@@ -388,7 +388,7 @@ def _road_area(center: np.ndarray, inner: np.ndarray, outer: np.ndarray, closed:
 
 
 def _area(ring: np.ndarray) -> BaseGeometry:
-    """Return the polygons that a border encloses, without the lines and points that it touches itself in."""
+    """Return the polygons that a border encloses, without lines and points at which the border touches itself."""
     polygon = shapely.Polygon(ring)
     if polygon.is_valid:
         return polygon

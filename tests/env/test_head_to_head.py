@@ -67,7 +67,7 @@ def meet(race: HeadToHead, mine_m: float, theirs_m: float, theirs_offset_m: floa
     race.step(np.tile(STOP, (race.n_cars, 1)))
     put(race, mine_m)
     put(race.rival, theirs_m, theirs_offset_m)
-    race._meet(race._everyone)
+    race._update_opponents(race._everyone)
     for one in (race, race.rival):
         one.rules.start_midway(np.full(race.n_cars, 10), 100 * one.rules.now.ndist)
 
