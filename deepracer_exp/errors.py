@@ -116,7 +116,7 @@ def _reason(error: Exception) -> str:
 
 
 def _one_line(text: str) -> str:
-    """Return a text without line breaks and control characters, and without the middle of what is very long."""
+    """Return a text without line breaks and control characters, and without the middle of a very long text."""
     text = _without_middle(text, _LONGEST_READ)
     line = "".join(
         letter if letter.isprintable() else repr(letter)[1:-1] for letter in " ".join(text.split())

@@ -74,7 +74,7 @@ def running(command: Sequence[str], **options: Any) -> Iterator[subprocess.Popen
             try:
                 if _IS_LINUX:
                     # This process alone holds the writing end. Once it is closed, the kernel kills the group.
-                    # PR_SET_PDEATHSIG would leave what the program has started, such as MLflow's server below its
+                    # PR_SET_PDEATHSIG would leave the program's own children, such as MLflow's server below its
                     # command, and would end the program with the thread that started it.
                     fcntl.fcntl(reading, fcntl.F_SETOWN, -process.pid)
                     fcntl.fcntl(reading, fcntl.F_SETSIG, signal.SIGKILL)

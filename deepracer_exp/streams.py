@@ -1,4 +1,4 @@
-"""The standard streams of a command: safe characters, and what happens when a stream cannot be written."""
+"""The standard streams of a command: safe characters, and streams that cannot be written."""
 
 import errno
 import os
@@ -97,7 +97,7 @@ def standard_streams() -> Iterator[Output]:
         except OSError:
             os.open(os.devnull, os.O_RDWR)
     before = {name: getattr(sys, name) for name in ("stdout", "stderr", "__stdout__", "__stderr__")}
-    outputs = {name: ShownOutput(before[name] or _nowhere()) for name in ("stdout", "stderr")}
+    outputs = {name: ShownOutput(before[name] or _null_stream()) for name in ("stdout", "stderr")}
     for name, output in outputs.items():
         if before[f"__{name}__"] is before[name]:
             setattr(sys, f"__{name}__", output)
@@ -120,5 +120,5 @@ def exit_code(output: Output, code: int) -> int:
     return 3
 
 
-def _nowhere() -> TextIO:
+def _null_stream() -> TextIO:
     return open(os.devnull, "w", encoding="utf-8")

@@ -47,7 +47,7 @@ def convolve(layers: nn.Sequential, pictures: Tensor, dtype: torch.dtype) -> Ten
 
 
 class _InParts(torch.autograd.Function):
-    """Convolves and differentiates each part on its own; arguments as of `convolve`, and weights with gradients."""
+    """Convolves and differentiates each part on its own; arguments as for `convolve`, and weights with gradients."""
 
     @staticmethod
     def forward(

@@ -108,8 +108,8 @@ class PPO(Algorithm):
         """Return the losses of a minibatch; override it for a loss of your own.
 
         Args:
-            minibatch: [N] steps with what the networks read (and the trunk's `hidden`), `action`,
-                `action_log_prob`, `advantage` and `value_target`.
+            minibatch: [N] steps with the networks' inputs (and the trunk's `hidden`), `action`, `action_log_prob`,
+                `advantage` and `value_target`.
 
         Returns:
             `loss_objective`, `loss_critic` and `loss_entropy`, which are added up, and `entropy`, `clip_fraction`,

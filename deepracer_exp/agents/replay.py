@@ -26,7 +26,7 @@ class Replay:
         self._buffer: ReplayBuffer | None = None
 
     def __len__(self) -> int:
-        """Return how many steps can be drawn."""
+        """Return the number of stored steps."""
         return 0 if self._buffer is None else len(self._buffer)
 
     def extend(self, batch: TensorDictBase) -> None:

@@ -85,12 +85,12 @@ def to_service(networks: PolicyNetworks, sensors: Sequence[str]) -> dict[str, Ar
 
     `sensors` are the names of the camera and the LIDAR as in model_metadata.json.
 
-    Kernels of convolutions are [height, width, in, out] and those of dense layers [in, out]; pictures are flattened
-    row by row with all channels of a pixel together; the readings of sensors follow each other in the order of their
-    names. Convolutions of 1x1 at the end of a picture's layers are the service's dense layers of an embedder, which it
-    applies to each pixel. A trunk that both share is written twice. Where the value network does not see what the
-    policy does, there are the policy's tensors alone, as of soft actor-critic, whose mean has the name of PPO's and
-    comes before the hyperbolic tangent.
+    Kernels of convolutions are [height, width, in, out] and those of dense layers [in, out]; pictures are flattened row
+    by row with all channels of a pixel together; the readings of sensors follow each other in the order of their names.
+    Convolutions of 1x1 at the end of a picture's layers are the service's dense layers of an embedder, which it applies
+    to each pixel. A trunk that both share is written twice. If the value network's inputs differ from the policy's,
+    only the policy's tensors are returned, as for soft actor-critic, whose mean has the name of PPO's and comes before
+    the hyperbolic tangent.
 
     Raises:
         BadInput: the networks have layers that the service's do not.
@@ -193,14 +193,14 @@ def match_service(
 
     Args:
         tensors: by name; of any agent (`agent`, `agent_0`), online or global.
-        networks: with separate trunks, which see what the service's do; also on the device `meta`. Of SAC, whose
-            tensors are those of `policy_of_sac`, the policy alone is matched.
+        networks: with separate trunks and the service's inputs; also on the device `meta`. Of SAC, whose tensors are
+            those of `policy_of_sac`, the policy alone is matched.
         sensors: as for `to_service`.
         where: file of the tensors, for messages.
 
     Returns:
-        The tensors by the names of `to_service`; and what has none, because a frozen graph does not hold it, or SAC has
-        it otherwise: the value network by its scope, the standard deviation by its name.
+        The tensors by the names of `to_service`; and the parts without tensors, because a frozen graph lacks them or
+        SAC has others: the value network by its scope, the standard deviation by its name.
 
     Raises:
         BadInput: a tensor is missing, has another shape, is not finite, or is none of these networks'.

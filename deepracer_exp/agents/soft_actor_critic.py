@@ -34,8 +34,8 @@ class SoftActorCritic(PolicyNetworks):
     """A policy and two critics, which share no layers.
 
     Attributes:
-        critics: Each reads what is seen and a continuous `action` -> `state_action_value` [..., 1]; or, for a list of
-            n actions, only what is seen -> `action_value` [..., n].
+        critics: Each reads the observation and a continuous `action` -> `state_action_value` [..., 1]; or, for a list
+            of n actions, only the observation -> `action_value` [..., n].
         action_count: Number of discrete actions, None for the continuous ones.
     """
 
@@ -56,7 +56,7 @@ class BoundedGaussian(nn.Module):
     """Mean and standard deviation before the hyperbolic tangent, both by the same layers, [..., 2] each."""
 
     def __init__(self, layers: nn.Module) -> None:
-        """Take layers with twice as many outputs as there are actions: the means, then logarithms of the deviations."""
+        """Wrap layers with two outputs per action: the means, then the logarithms of the deviations."""
         super().__init__()
         self.layers = layers
 

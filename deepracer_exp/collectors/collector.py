@@ -366,10 +366,10 @@ def open_collector(
         config: the collector's group.
         algorithm: says how many frames or episodes an iteration has.
         setup: the race.
-        policy: reads what its network sees of a `RaceEnv`, writes `action` and its log-probability.
+        policy: reads its keys of a `RaceEnv`, writes `action` and its log-probability.
         run_dir: where workers leave crash dumps and prints.
         state: `state_dict` of a collector of the same configuration and setup: with the same weights, the next batch
-            is what that one would have returned next, bit for bit. None or empty: new episodes begin.
+            equals that of the original collector, bit for bit. None or empty: new episodes begin.
         rivals: of the cars; None: they are alone.
 
     Raises:
@@ -399,7 +399,7 @@ def steps_per_batch(config: CollectorConfig, frames: int) -> int:
 
 
 def cars_per_process(config: CollectorConfig) -> int:
-    """Return how many of the cars drive in each process."""
+    """Return the number of cars in each process."""
     return config.cars // max(1, worker_count(config))
 
 

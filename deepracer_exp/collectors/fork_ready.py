@@ -1,7 +1,7 @@
 """Imported last by the fork server, and by nothing else: makes the slow first compiled call of a process.
 
-numba then loads what all its functions need, a third of a second, which the server does while the training process
-imports; each worker would do it while the training waits.
+numba then loads its runtime, a third of a second, which the server does while the training process imports; each worker
+would do it while the training waits.
 """
 
 import gc

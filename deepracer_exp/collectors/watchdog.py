@@ -98,7 +98,7 @@ class Watchdog:
             may_rest = (beats >= self._asked) & (beats < self._asked).any()
             is_silent = (beats == seen) & ~may_rest & self._waiting.is_set()
             seen = beats
-            # Workers that are being started share what is compiled, so that some wait for others.
+            # Starting workers share compiled code, so that some wait for others.
             of_all = use_of_this() if is_silent.any() and self._processes is None else None
             for worker, silence in enumerate(silences):
                 if not is_silent[worker]:

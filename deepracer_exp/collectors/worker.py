@@ -153,7 +153,7 @@ class _StateKeepingEnv(RaceEnv):
         return {"race": self.race.state_dict(), "drawn": self._noise.steps}
 
     def put_state(self, state: Mapping[str, Any]) -> None:
-        """Continue from what `take_state` returned; the reset that follows leaves the cars there and draws nothing."""
+        """Continue from a state of `take_state`; the reset that follows leaves the cars there and draws nothing."""
         self.resume_from(state["race"])
         self._noise.steps = state["drawn"] - 1
         self._draw()

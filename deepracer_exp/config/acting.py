@@ -122,7 +122,7 @@ def remember() -> None:
 def leave_out_foreign(config: dict[str, Any], where: str) -> list[str]:
     """Remove foreign acting values from a stored configuration; return a line for each of them.
 
-    The configuration is changed in place; `where` says in the lines what stores it.
+    The configuration is changed in place; `where` names its place in the lines.
 
     Code stays as text: `refuse_reward` and `load_class` decide about it before it is run.
     """
@@ -156,7 +156,7 @@ def _wandb_words(tracking: Mapping[str, Any]) -> str:
 def refuse_reward(file: str | None, where: str, copy: Path | None = None) -> None:
     """Refuse to run a file as reward function that only a stored configuration names.
 
-    `where` says what stores the configuration. The message names `copy` if the file is not on this machine.
+    `where` names the place of the configuration. The message names `copy` if the file is not on this machine.
 
     Raises:
         BadInput: the message says how the user names it.

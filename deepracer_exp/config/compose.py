@@ -89,7 +89,7 @@ def compose_experiment(overrides: Sequence[str], *, stored: bool = False) -> tup
 def trusted(composition: Composition, *, stored: bool) -> Composition:
     """Allow the acting values that the user has named; leave the foreign ones out of a study's values.
 
-    `stored` is as of `compose_experiment`.
+    `stored` is as for `compose_experiment`.
     """
     if not stored:
         allow(composition.mapping)

@@ -156,7 +156,7 @@ class ObservationShape(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeConfig:
-    """Where an episode starts and what ends it (rules of the service's simulator)."""
+    """Start and end of an episode (rules of the service's simulator)."""
 
     start_offset: Annotated[float, Field(ge=0, lt=1)]
     start_advance: Fraction
@@ -199,7 +199,7 @@ Offset = Annotated[float, Field(ge=-15, le=15, allow_inf_nan=False)]
 Deviation = Annotated[float, Field(ge=0, le=15, allow_inf_nan=False)]
 Objects = Annotated[int, Field(ge=0, le=50)]
 Height = Annotated[float, Field(ge=-0.1, le=0.5, allow_inf_nan=False)]
-# From -1/3 on, the picture's corners would show what lies nearer to its middle once more.
+# From -1/3 on, the picture's corners would repeat parts nearer to its middle.
 Distortion = Annotated[float, Field(ge=-0.3, le=0.3, allow_inf_nan=False)]
 
 # Beyond, a policy would learn other clearances than the crash rule has.

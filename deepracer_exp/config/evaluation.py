@@ -1,4 +1,4 @@
-"""How a policy is evaluated (`conf/evaluation/`), and the entry point of evaluate."""
+"""Evaluation protocols (`conf/evaluation/`), and the entry point of evaluate."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal

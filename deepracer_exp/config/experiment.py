@@ -47,7 +47,7 @@ def _device(name: str) -> str:
     return name
 
 
-def _off(kept: object) -> object:
+def _read_off(kept: object) -> object:
     """Read YAML's `off`, which YAML takes for false, as the word."""
     return "off" if kept is False else kept
 
@@ -79,10 +79,10 @@ class Experiment:
     tracking: TrackingConfig
     race: RaceConfig = ALONE
     device: Annotated[str, AfterValidator(_device)] = "cpu"
-    trace: Annotated[Literal["full", "laps", "off"], BeforeValidator(_off)] = "full"
+    trace: Annotated[Literal["full", "laps", "off"], BeforeValidator(_read_off)] = "full"
 
     def __post_init__(self) -> None:
-        """Refuse groups that contradict each other, such as a network that cannot read what is observed."""
+        """Refuse groups that contradict each other, such as a network that cannot read the observation."""
         algorithm = self.algorithm
         if isinstance(algorithm, SACConfig):
             self._check_sac()

@@ -113,7 +113,7 @@ def _file_overrides(
         )
         notes.append(f"{source}: used as {', '.join(taken)}")
     job, applied = job_overrides(files.job, typed) if files.job else ([], [])
-    notes += [*applied, *_left(files, typed)]
+    notes += [*applied, *_unused_files(files, typed)]
     return [*lines, *job], names, [*notes, *files.remarks()]
 
 
@@ -127,7 +127,7 @@ def car_override(files: CustomFiles, typed: Mapping[str, str]) -> tuple[list[str
     return lines, [f"model_metadata.json: version={files.metadata.version}: {used}"]
 
 
-def _left(files: CustomFiles, typed: Mapping[str, str]) -> list[str]:
+def _unused_files(files: CustomFiles, typed: Mapping[str, str]) -> list[str]:
     """Return a line for each file that is not used."""
     notes = list(files.unused)
     for name, (wanted, others) in files.left.items():

@@ -170,7 +170,7 @@ class _Values:
         return number
 
     def positions(self) -> list[dict[str, object]]:
-        """Return where boxes stand, as `race.boxes.positions`.
+        """Return the places of boxes, as `race.boxes.positions`.
 
         Raises:
             BadInput: they are none that the service reads.

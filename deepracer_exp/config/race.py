@@ -18,7 +18,7 @@ LANES = ("inner", "outer")
 
 @dataclass(frozen=True, kw_only=True)
 class BoxPosition:
-    """Where a box stands."""
+    """The place of a box."""
 
     lap: Share
     lane: Literal["inner", "outer"]
@@ -47,7 +47,7 @@ class BoxesConfig:
 
     @property
     def count(self) -> int:
-        """Return how many boxes there are."""
+        """Return the number of boxes."""
         return len(self.positions) if self.placement == "fixed" else self.number
 
 
@@ -65,7 +65,7 @@ class BotsConfig:
 
     @property
     def count(self) -> int:
-        """Return how many bots there are."""
+        """Return the number of bots."""
         return self.number
 
 
@@ -117,7 +117,7 @@ class RaceConfig:
 
     @property
     def others(self) -> int:
-        """Return how many boxes, bots and rivals there are around a car."""
+        """Return the number of boxes, bots and rivals around a car."""
         return self.boxes.count + self.bots.count + (self.rivals is not None)
 
 

@@ -78,7 +78,7 @@ TrackingConfig = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class CheckpointsConfig:
-    """How the best policy of a run is chosen, and how many checkpoints are kept."""
+    """Choice of a run's best policy, and number of kept checkpoints."""
 
     every: Count | None
     metric: Literal["race_score", "reliable_lap", "lap_time", "progress"]

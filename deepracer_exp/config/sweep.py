@@ -164,7 +164,7 @@ class SweepRequest:
 
     @cached_property
     def runs_dir(self) -> Path:
-        """Where the runs of the trials are.
+        """The folder of the trials' runs.
 
         Raises:
             BadInput: it is not a path.

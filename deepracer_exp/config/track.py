@@ -15,7 +15,7 @@ DashLength = Annotated[float, Field(ge=0.01, allow_inf_nan=False)]
 
 @dataclass(frozen=True, kw_only=True)
 class FloorConfig:
-    """What the road is made of."""
+    """Grip, lines and colours of a track and its surroundings."""
 
     friction: Positive
     road_color: Color

@@ -121,7 +121,7 @@ def state(run: RunRecord) -> str:
 
 
 def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return commands for a run folder with its summary.json, each with what it does, the first to be used first."""
+    """Return commands for a run folder with its summary.json, each with its purpose, the first to be used first."""
     word, name, config = run_word(run), own_word(run), read_config(run)
     resume, clone = command_line("resume", name, config), command_line("clone", word, config)
     # A clone has had its second phase, and a policy for the physical car changing conditions of its own.
@@ -194,7 +194,7 @@ def _rates_that_follow(config: Mapping[str, Any]) -> list[str]:
 
 
 def open_report(run: Path) -> tuple[str, str]:
-    """Return the command that opens the report of a run, with what it does."""
+    """Return the command that opens the report of a run, with its purpose."""
     return f"{shlex.join([COMMAND, 'analyze', run_word(run)])} --open", "open its report"
 
 

@@ -1,4 +1,4 @@
-"""The log of what reward functions print."""
+"""The log of reward functions' prints."""
 
 import time
 from collections.abc import Callable
@@ -8,7 +8,7 @@ from typing import Any, BinaryIO
 
 
 class RewardPrints:
-    """Appends what reward functions print to one file, at a limited rate and up to a limited size.
+    """Appends reward functions' prints to one file, at a limited rate and up to a limited size.
 
     Several processes may share the file: each line is one write to a file opened for appending. The rate
     (a bucket of one second's lines) is kept per process, the size per file. A print never fails a run: lines

@@ -249,7 +249,7 @@ def answers(
     path: str,
     time_limit_s: float,
 ) -> Iterator[Value | Failure]:
-    """Call a function of a reward module with each of the params in their order, and yield what it returns.
+    """Call a function of a reward module with each of the params in their order, and yield its results.
 
     `path` is the module's, for the line of an error; the limit is of each call.
     """

@@ -44,7 +44,7 @@ class TimeLimit:
     def __enter__(self) -> Self:
         if self._holds:
             self._began_s, self._cpu_began_s = time.monotonic(), time.thread_time()
-            self._handler = signal.signal(signal.SIGALRM, self._look)
+            self._handler = signal.signal(signal.SIGALRM, self._check)
             every_s = self._limit_s / _LOOKS
             self._timer = signal.setitimer(signal.ITIMER_REAL, every_s, every_s)
         return self
@@ -60,7 +60,7 @@ class TimeLimit:
                 left_s = max(left_s - (time.monotonic() - self._began_s), 1e-3)
                 signal.setitimer(signal.ITIMER_REAL, left_s, interval_s)
 
-    def _look(self, signum: int, frame: FrameType | None) -> None:
+    def _check(self, signum: int, frame: FrameType | None) -> None:
         if self._is_over or frame is None or frame.f_code.co_filename == __file__:
             return
         self._looks += 1

@@ -44,7 +44,7 @@ class StoredPolicy:
 def read_checkpoint(experiment: Experiment, folder: Path, name: str) -> StoredPolicy:
     """Read the networks of a checkpoint, or of the newest intact one if one of `LINKS` is corrupt.
 
-    `folder` and `name` as of `find_checkpoint`.
+    `folder` and `name` are as for `find_checkpoint`.
 
     Raises:
         BadInput: as for `intact_checkpoint` and `read_policy`.
@@ -56,7 +56,7 @@ def intact_checkpoint(folder: Path, name: str, *, resumable: bool = False) -> Pa
     """Return the folder of a checkpoint whose files all match their hashes.
 
     If one of `LINKS` is corrupt, or `last` is missing, the newest intact checkpoint is used, with a warning. With
-    `resumable`, it is one that a training can resume from; `folder` and `name` as of `find_checkpoint`.
+    `resumable`, it is one that a training can resume from; `folder` and `name` are as for `find_checkpoint`.
 
     Raises:
         BadInput: there is no such checkpoint, it lies elsewhere, or it is corrupt and so are all others. Files that
@@ -155,15 +155,15 @@ class CheckpointStore:
     """`checkpoints/` of a run folder: one directory per kept iteration, and the links of `LINKS`.
 
     A directory is written aside with the hashes of its files and moved into place whole (torchrl.checkpoint: tensors
-    and JSON, no pickle); a link changes in one step, and what is older is removed after that. So whenever the run is
-    killed, all names lead to a complete checkpoint.
+    and JSON, no pickle); a link changes in one step, and older checkpoints are removed after that. So whenever the run
+    is killed, all names lead to a complete checkpoint.
 
     The replay of an agent that has one is large, and kept of `last` and of the checkpoint before it alone: in `replay/`
     of the run folder, under the checkpoint's name, written in the same way before the checkpoint.
     """
 
     def __init__(self, run_dir: Path, keep: int, every: int | None = None):
-        """Open the folder, make it if there is none, and clear away what a kill left unfinished.
+        """Open the folder, make it if there is none, and remove the unfinished files of a killed process.
 
         `keep` of the newest checkpoints stay. With `every` iterations between two evaluations only evaluated
         checkpoints stay, so that all of them can be compared at the end; None: there are no evaluations, and any
@@ -193,7 +193,7 @@ class CheckpointStore:
     ) -> None:
         """Save the agent under the number of its iteration.
 
-        `training` is the rest of what a resumed training needs: tensors, arrays and JSON types; None: no training can
+        `training` is the further state of a resumed training: tensors, arrays and JSON types; None: no training can
         resume from here, and the checkpoint is not `last`. `best`: it is the best so far; `fastest`: it laps fastest of
         the reliable ones.
 
@@ -224,7 +224,7 @@ class CheckpointStore:
                 self._link(label, checkpoint_name(iteration))
 
     def rewind(self, iteration: int, best: int | None, fastest: int | None = None) -> None:
-        """Go back to an iteration: `last` is its checkpoint, and what came later goes, unless it must stay.
+        """Go back to an iteration: `last` is its checkpoint, and later ones are removed unless pinned.
 
         `best` is the iteration of the best checkpoint up to there, `fastest` that of the one which laps fastest of the
         reliable ones; None if there was none.

@@ -1,4 +1,4 @@
-"""Find and remove what is no longer needed in run folders."""
+"""Find and remove unneeded parts of run folders."""
 
 import os
 import shutil
@@ -61,7 +61,7 @@ class Removable:
 
     run: Path
     what: str
-    """One of the words above."""
+    """One of the constants above."""
     paths: tuple[Path, ...]
     size: int
     """Bytes."""
@@ -79,12 +79,12 @@ class Removables:
 
 
 def survey(runs_dir: Path, overview: StoreOverview | None) -> Removables:
-    """Find what may be removed; nothing is changed.
+    """Find removable parts; nothing is changed.
 
     Without `overview`, the data of MLflow, only the trace of a run that is recorded there may be removed.
 
     Raises:
-        BadInput: a file that says what must be kept cannot be read.
+        BadInput: a file of pins cannot be read.
     """
     removables = Removables()
     try:
@@ -182,7 +182,7 @@ def replays(offered: Sequence[Removable]) -> list[Removable]:
 def _early(item: Removable) -> Removable | None:
     """Return all of a trace but the newest tenth of its iterations and at least ten; None: it has no more.
 
-    The newest are what pages read of a trace that is too long for memory. A file has the number of its last iteration.
+    Pages read the newest ones of a trace that is too long for memory. A file has the number of its last iteration.
     """
     (trace,) = item.paths
     files = sorted(path for path in trace.iterdir() if path.is_file() and not path.is_symlink())

@@ -16,8 +16,8 @@ from .files import CRASH_DUMPS
 def write_crash_dump(run_dir: Path, error: BaseException, worker: int | None = None) -> None:
     """Write the error's line, and its `params` and `arrays` if it has them, under `faults/` as JSON and .npz.
 
-    On a full disk, what does not fit is left out, so that the error itself is not lost. `worker` is the number of the
-    process, None for the training process.
+    On a full disk, parts that do not fit are left out, so that the error itself is not lost. `worker` is the number of
+    the process, None for the training process.
     """
     folder = run_dir / CRASH_DUMPS
     stem = "training" if worker is None else f"worker-{worker}"

@@ -1,4 +1,4 @@
-"""The files of a run folder: their names, and what a training wrote into them."""
+"""The files of a run folder: names and contents."""
 
 import contextlib
 import getpass

@@ -1,4 +1,4 @@
-"""The runs of a folder as rows: what `deepracer-exp runs` lists."""
+"""The runs of a folder as rows for `deepracer-exp runs`."""
 
 import datetime
 import math
@@ -39,10 +39,10 @@ COLUMNS = (
     "note",
     "id",
 )
-"""Columns of a row; `tag.KEY` for each tag follows. `run` is EXPERIMENT/FOLDER, `began` an ISO time, `lap_s`
-the mean usual lap of the best checkpoint, `score_s` its race score (usual and held-out), `exploring_lap_s` the fastest
-exploring lap, all in seconds; of a run in progress, what it has reached so far. `study` and `trial`: of a run that a
-sweep has made, once it has ended."""
+"""Columns of a row; `tag.KEY` for each tag follows. `run` is EXPERIMENT/FOLDER, `began` an ISO time, `lap_s` the mean
+usual lap of the best checkpoint, `score_s` its race score (usual and held-out), `exploring_lap_s` the fastest exploring
+lap, all in seconds; of a run in progress, those so far. `study` and `trial`: of a run that a sweep has made, once it
+has ended."""
 
 Row = dict[str, Any]
 RUNNING, KILLED = "running", "killed"
@@ -80,7 +80,7 @@ def _of_folder(folder: Path) -> Row:
 
 
 def _so_far(folder: Path) -> dict[str, Any]:
-    """Return what a run in progress has reached, by the keys of a summary: from its metrics and its best checkpoint."""
+    """Return the figures of a run in progress, by the keys of a summary: from its metrics and its best checkpoint."""
     try:
         rows = read_metrics(folder / METRICS)
     except BadInput:  # it has only begun

@@ -66,7 +66,7 @@ EVALUATION_COLUMNS: Mapping[str, tuple[str, str]] = {
     "completion": ("float64", "per cent of the lap, mean over the trials"),
     "held_out_completion": (
         "float64",
-        "the same under held-out conditions; NaN where not evaluated",
+        "the same on conditions held out of the training; NaN where not evaluated",
     ),
     "lap_share": ("float64", "complete laps as a share of those tried; NaN where not known"),
     "laps": ("float64", "complete laps; NaN where not known"),
@@ -137,7 +137,7 @@ def is_traced_run(folder: Path) -> bool:
 
 
 def read_log(path: Path) -> Recording | RunRecording | EvaluationRecording:
-    """Read a run or an evaluation of ours, or what the service or its relatives have recorded.
+    """Read a run or an evaluation of ours, or a recording of the service or its relatives.
 
     Raises:
         BadInput: nothing is there, or nothing of it can be read.
@@ -202,7 +202,7 @@ def _steps(folder: Path, problems: list[LogProblem], files: list[Path]) -> pd.Da
                 file = stack.enter_context(open_trace_file(path))
                 count = skipped = file.metadata.num_rows
                 if room:
-                    skipped = _too_old(file, room)
+                    skipped = _rows_to_drop(file, room)
                     if skipped < count:
                         opened[path] = file, skipped
             except UNREADABLE as error:
@@ -260,7 +260,7 @@ def _columns(
     return {name: columns[name] for name in STEP_COLUMNS}
 
 
-def _too_old(file: pq.ParquetFile, room: int) -> int:
+def _rows_to_drop(file: pq.ParquetFile, room: int) -> int:
     """Return the number of first rows to drop, so that at most `room` rows of whole iterations are left."""
     if file.metadata.num_rows <= room:
         return 0

@@ -50,7 +50,7 @@ def with_unit(number: str, unit: str) -> str:
 
 @dataclass(frozen=True)
 class Ending:
-    """How a run ended; its fields are keys of summary.json."""
+    """The ending of a run; its fields are keys of summary.json."""
 
     status: str
     """FINISHED, STOPPED_EARLY (more training would not have helped), INTERRUPTED or FAILED."""

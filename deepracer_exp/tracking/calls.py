@@ -128,13 +128,13 @@ def _sentence(error: BaseException) -> str:
             "MLFLOW_TRACKING_PASSWORD"
         )
     if status is not None:
-        return f"the server answers with error {status}{_said(text)}"
+        return f"the server answers with error {status}{_server_text(text)}"
     if isinstance(error, ParseError) or ("valid JSON" in text and not isinstance(error, RestException)):
         return "the answer is not that of an MLflow server"
     return redacted_line(getattr(error, "orig", None) or error)
 
 
-def _said(text: str) -> str:
+def _server_text(text: str) -> str:
     """Extract the server's own text, beside its error code, from MLflow's message; it may be a page."""
     quoted = re.search(r"Response body: '(.*)'", text)
     words = re.sub(r"<[^>]*>", " ", quoted[1]) if quoted else ""

@@ -68,7 +68,7 @@ def deliver_evaluation(
 ) -> None:
     """Record the results of evaluating a checkpoint of a recorded run in MLflow; errors are logged.
 
-    `uri` and `runs_dir` as of `deliver`, `env_steps` are those of the checkpoint, `metrics` have MLflow's names,
+    `uri` and `runs_dir` are as for `deliver`, `env_steps` are those of the checkpoint, `metrics` have MLflow's names,
     `files` map each file to its folder in MLflow.
     """
     run_id = read_run_id(run_dir)

@@ -1,4 +1,4 @@
-"""The runs of an MLflow store as rows: what `deepracer-exp runs tracking.uri=URI` lists."""
+"""The runs of an MLflow store as rows for `deepracer-exp runs tracking.uri=URI`."""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -154,7 +154,7 @@ def run_params(
 ) -> dict[str, str]:
     """Return the parameters by which runs are compared; the run's config.yaml has all values.
 
-    These are the choices, by readable names where there are some, what racers vary, and the keys of the overrides.
+    These are the choices, by readable names where there are some, the often varied keys, and those of the overrides.
     """
     compared = {*_COMPARED, *({*map(key_of, overrides)} - choices.keys())}
     values = {

@@ -138,7 +138,7 @@ class ProjectedRun:
         of a core, its CPU time counts.
         """
         self._projector.look(self.folder, self._target)
-        wait_patiently(partial(_comes, self._is_settled), deadline_s)
+        wait_patiently(partial(_arrives, self._is_settled), deadline_s)
         recorded = self.recorded
         if recorded.end_ms == self.run.end_ms:
             return recorded.problem
@@ -157,14 +157,14 @@ class ProjectedRun:
             )
             return is_open or recorded.is_refused or self._projector.is_lost
 
-        wait_patiently(partial(_comes, has_answered), deadline_s)
+        wait_patiently(partial(_arrives, has_answered), deadline_s)
         return self.recorded
 
     def _is_settled(self) -> bool:
         return self.recorded.end_ms == self.run.end_ms or self._projector.is_lost
 
 
-def _comes(what: Callable[[], bool], seconds: float) -> bool:
+def _arrives(what: Callable[[], bool], seconds: float) -> bool:
     """Return whether an answer arrives within the given seconds."""
     end = time.monotonic() + seconds
     while not what() and time.monotonic() < end:

@@ -247,7 +247,7 @@ class TrackingCallback(Callback):
             self._tracker.log(eval_columns(trainer.evaluation), step=trainer.env_steps)
 
     def on_run_end(self, trainer: Trainer, result: TrainResult) -> None:
-        """Let the tracker end the run; the result says what was not recorded."""
+        """Let the tracker end the run; the result names missing records."""
         self._tracker.set_tag(END_TAG, str(result.ending))
         if self._tracker.outage is not None:
             line = f"{self._tracker.outage}; waiting for at most {FINISH_S:g} s"

@@ -51,8 +51,8 @@ def plan_clone(parent: StoredRun, changes: Sequence[str], *, stored: bool = Fals
     user.
 
     Raises:
-        BadInput: what the overrides ask for is not accepted or does not fit the parent's networks, or the reward
-            function or a class is not the user's own.
+        BadInput: the overrides are not accepted or do not fit the parent's networks, or the reward function or a class
+            is not the user's own.
     """
     composition = _changed(parent, changes, stored)
     experiment = parse_experiment(composition.mapping)

@@ -51,9 +51,9 @@ class Record:
     """Counts of finished episodes and laps, the fastest lap, and the last episodes."""
 
     def __init__(self, remembered: int):
-        """Begin with nothing.
+        """Start at zero.
 
-        `remembered` is how many of the last finished episodes `lap_share` looks at.
+        `remembered` is the number of last finished episodes in `lap_share`.
         """
         self._laps_of_last: deque[bool] = deque(maxlen=remembered)
         self.finished = 0
@@ -248,7 +248,7 @@ class Ranking:
     """
 
     def __init__(self, lengths_m: Sequence[float]):
-        """Begin without a result."""
+        """Start without results."""
         self._lengths_m = lengths_m
         self._completion = np.full(len(lengths_m), np.nan)
         self._speed_mps = np.full(len(lengths_m), np.nan)

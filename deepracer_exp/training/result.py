@@ -34,5 +34,5 @@ class TrainResult:
 
     @property
     def reason(self) -> str:
-        """A sentence on what ended it."""
+        """A sentence on why it ended."""
         return self.ending.reason

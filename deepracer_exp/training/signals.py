@@ -39,7 +39,7 @@ class Interruption:
     def __enter__(self) -> "Interruption":
         """Begin to listen."""
         for signum in (signal.SIGINT, signal.SIGTERM):
-            self._before[signum] = before = signal.signal(signum, self._hear)
+            self._before[signum] = before = signal.signal(signum, self._on_signal)
             outer = getattr(before, "__self__", None)
             if isinstance(outer, Interruption):
                 self._outer, self.signum = outer, outer.signum
@@ -58,7 +58,7 @@ class Interruption:
         """Return 128 + the signal's number, None if none came."""
         return None if self.signum is None else 128 + self.signum
 
-    def _hear(self, signum: int, _: FrameType | None) -> None:
+    def _on_signal(self, signum: int, _: FrameType | None) -> None:
         if self.signum is not None:
             raise KeyboardInterrupt
         self.signum = signum

@@ -97,12 +97,13 @@ class Trainer:
     """Trains one run: collects, updates, measures, and calls its callbacks after every iteration.
 
     Attributes:
-        experiment: what is trained.
+        experiment: the trained experiment.
         setup: its files, read.
         folder: the run's folder.
         callbacks: in the order in which they are called.
         networks: policy and value.
-        agent: the algorithm. rivals: of its cars; None: they are alone.
+        agent: the algorithm.
+        rivals: of its cars; None: they are alone.
         metrics: episodes and laps so far.
         budget: the limits and how much of them is used.
         checkpoints: the run's own.
@@ -216,7 +217,7 @@ class Trainer:
                 if self.best.drove_best(finished, self.counters()):
                     self.checkpoints.save(self.agent, self.counters(), best=True)
 
-                # 2. Update the networks, pass them to the cars, and let these drive on during what follows.
+                # 2. Update the networks, pass them to the cars, and let these drive on during the next phases.
                 began = time.monotonic()
                 update = self._update(batch)
                 collector.publish_policy()
