@@ -4,8 +4,8 @@ Definitions: Agarwal et al., Deep Reinforcement Learning at the Edge of the Stat
 strata: one array a track, one value a seed. Seeds are resampled within their track, never from one track to another.
 
 The percentiles of an interval are moved outwards for few seeds (Hesterberg, What Teachers Should Know About the
-Bootstrap, 2015, "expanded percentile interval"): the plain ones call 5 seeds against 5 of the same distribution
-different in 6 to 12 per cent of cases, and 3 against 3 in 20.
+Bootstrap, 2015, "expanded percentile interval"): those of the plain one take 5 seeds against 5 of the same distribution
+for different in 6 to 12 per cent of cases, and 3 against 3 in 20.
 """
 
 import math

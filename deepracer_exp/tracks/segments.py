@@ -1,9 +1,10 @@
-"""Exact queries on polylines and polygons in constant time, whatever their length or number.
+"""Exact queries on polylines and polygons at a cost that does not grow with their length or number.
 
-A uniform grid stores for each cell every segment that can be nearest to some point of the cell. Let c be the cell's
-centre and h its half diagonal: the nearest segment of any point of the cell lies within d(c) + 2 h of c, where d(c) is
-the distance from c to the polyline. The stored set therefore contains every answer, and testing it alone is exact. The
-edges of polygons are sorted into horizontal bands, and a point is tested against those of its own band.
+A uniform grid stores for each cell every segment that can be nearest to some point of the cell. Let c be
+the cell's centre and h its half diagonal: no point of the cell is farther than h from c, so the nearest
+segment of any point p of the cell lies within d(c) + 2 h of c, where d(c) is the distance from c to the
+polyline. The stored set is therefore a superset of the answers, and testing it alone is exact. The edges of polygons
+are sorted into horizontal bands, and a point is tested against those of its own band.
 """
 
 import math
