@@ -26,8 +26,19 @@ from deepracer_exp.validation.validate import read
 from tests.test_own_classes import write_examples
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 GENERATED = {"commands.md", "configuration.md"}
+
+
+def _name(page):
+    return page.relative_to(ROOT).as_posix()
+
+
+def _anchors(page):
+    """Return the anchors of a page's headings, as both the site and GitHub make them."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    words = [re.sub(r"[^\w\s-]", "", re.sub(r"\]\(.*?\)", "", heading)) for heading in headings]
+    return {re.sub(r"\s+", "-", heading.strip().lower()) for heading in words}
 
 
 def _reference():
@@ -41,11 +52,13 @@ def test_the_readme_has_at_most_120_lines():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 120
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_linked_file_exists(page):
-    for link in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_every_linked_file_and_heading_exists(page):
+    for link, anchor in re.findall(r"\]\(([^)#]*)#?([^)]*)\)", page.read_text(encoding="utf-8")):
         if not link.startswith("http"):
-            assert (page.parent / link).is_file(), link
+            target = page.parent / link if link else page
+            assert target.is_file(), link
+            assert not anchor or anchor in _anchors(target), f"{link}#{anchor}"
 
 
 def test_the_configuration_page_has_every_group_and_option_and_the_default_in_bold():
@@ -67,8 +80,10 @@ def test_the_page_of_commands_has_every_command():
 
 
 def test_the_site_lists_every_page():
-    listed = re.findall(r": (\w+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
-    assert sorted(listed) == sorted({path.name for path in (ROOT / "docs").glob("*.md")} | GENERATED)
+    listed = re.findall(r": ([\w/]+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
+    docs = ROOT / "docs"
+    pages = {path.relative_to(docs).as_posix() for path in docs.rglob("*.md")}
+    assert sorted(listed) == sorted(pages | GENERATED)
 
 
 def test_the_picture_of_the_layers_shows_those_that_are_checked():
@@ -92,7 +107,7 @@ def _commands():
         for line in re.findall(r"^(?:    |\$ )?(deepracer-exp .*)$", text, re.MULTILINE):
             words = shlex.split(line, comments=True)
             if "..." not in words and "COMMAND" not in words:
-                shown.setdefault(tuple(words[1:]), page.name)
+                shown.setdefault(tuple(words[1:]), _name(page))
     return [pytest.param(words, id=f"{page}: {shlex.join(words)}") for words, page in shown.items()]
 
 
@@ -189,7 +204,7 @@ def test_every_import_shown_works(line):
     exec(line, {})
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=_name)
 def test_every_file_of_ours_that_is_named_exists(page):
     named = re.findall(
         r"`((?:deepracer_exp|sweeps|tests|benchmarks|conf|docs)/[\w/.-]+)`", page.read_text("utf-8")
