@@ -4,7 +4,7 @@
 
 Takes the folders, files and archives that `deepracer-exp analyze` reads, and reports the errors on what the car is
 fitted to. How well such a car predicts a recording that it was not fitted to says `benchmarks.fidelity
---leave-one-out`. docs/fidelity.md explains the measure.
+--leave-one-out`. docs/measured/fidelity.md explains the measure.
 """
 
 import dataclasses

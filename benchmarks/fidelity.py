@@ -4,7 +4,7 @@
 
 Takes the folders, files and archives that `deepracer-exp analyze` reads, of any generation; each is measured with the
 car of its version. With --leave-one-out it is measured with a car that is fitted to the other recordings of its
-version alone, which takes some minutes. docs/fidelity.md explains the measure.
+version alone, which takes some minutes. docs/measured/fidelity.md explains the measure.
 """
 
 import sys
@@ -251,7 +251,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--car", help="one simulated car for all (an option of conf/car)")
     parser.add_argument(
-        "--figures", type=Path, help="also draw the figures of docs/fidelity.md into this folder"
+        "--figures", type=Path, help="also draw the figures of docs/measured/fidelity.md into this folder"
     )
     options = parser.parse_args(arguments)
     if options.car is not None:

@@ -1,4 +1,4 @@
-"""The figures of docs/fidelity.md: recorded laps and simulated ones, and what the errors look like."""
+"""The figures of docs/measured/fidelity.md: recorded laps and simulated ones, and what the errors look like."""
 
 from collections.abc import Sequence
 from pathlib import Path
