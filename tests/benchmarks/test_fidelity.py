@@ -59,8 +59,7 @@ def test_each_version_is_measured_with_its_own_car_by_band_and_recording_and_dra
 
 @pytest.mark.parametrize(
     ("recording", "error_m", "bends", "turned_too_far"),
-    # In the second the commanded speed alternates between 1.33 and 4 m/s: docs/measured/fidelity.md, "What is not
-    # reached".
+    # In the second the commanded speed alternates between 1.33 and 4 m/s: docs/measured/fidelity.md, Remaining errors.
     [("droa_v6_fast", 0.065, 200, 0.04), ("droa_v6_alternating", 0.175, 20, 0.09)],
 )
 def test_the_car_of_version_6_is_as_fast_as_the_recorded_one_and_turns_as_far_in_sustained_bends(
