@@ -28,6 +28,16 @@ from tests.test_own_classes import write_examples
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 GENERATED = {"commands.md", "configuration.md"}
+LONG_GUIDES = {
+    "evaluation.md",
+    "extending.md",
+    "faster_laps.md",
+    "gallery.md",
+    "lineage.md",
+    "randomization.md",
+    "scaling.md",
+    "upgrade.md",
+}
 
 
 def _name(page):
@@ -84,6 +94,14 @@ def test_the_site_lists_every_page():
     docs = ROOT / "docs"
     pages = {path.relative_to(docs).as_posix() for path in docs.rglob("*.md")}
     assert sorted(listed) == sorted(pages | GENERATED)
+
+
+def test_a_guide_has_at_most_900_words():
+    site = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
+    (guides,) = (section["Guides"] for section in site["nav"] if "Guides" in section)
+    names = {name for guide in guides for name in guide.values()}
+    words = {name: len((ROOT / "docs" / name).read_text(encoding="utf-8").split()) for name in names}
+    assert {name for name in names if words[name] > 900} <= LONG_GUIDES
 
 
 def test_the_picture_of_the_layers_shows_those_that_are_checked():
