@@ -91,7 +91,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     ranges = {name: list(ends) for name, ends in vars(trained).items()}
     ways = {"without": [], "with": [override_line("randomization.pictures", ranges)]}
     driven: dict[str, list[dict[str, float]]] = {way: [] for way in ways}
-    fixed = ["observation=camera_small", "stopping=none", "checkpoints.every=null", "tracking=off"]
+    fixed = ["observation=camera_small", "randomization=none", "stopping=none", "checkpoints.every=null"]
+    fixed += ["tracking=off"]
     for seed in range(options.seeds):
         for way, own in ways.items():
             with tempfile.TemporaryDirectory() as folder:
