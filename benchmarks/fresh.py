@@ -33,7 +33,7 @@ class Driven:
     lap_time_s: float | None
     """Mean of the complete laps, None without one."""
     held_out_completion: float
-    """The same, with friction, noise and the like that it was not trained on."""
+    """The same on held-out conditions: other friction, noise and the like."""
     held_out_lap_time_s: float | None
 
     def figures(self) -> dict[str, float | None]:

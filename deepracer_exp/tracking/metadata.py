@@ -204,7 +204,7 @@ OURS = "Trainings of `deepracer-exp`."
 _RACE = {
     "lap_time_s": "mean usual lap {:.2f} s",
     "completion": "{:.1f}% of the lap",
-    "held_out_completion": "{:.1f}% on conditions not trained on",
+    "held_out_completion": "{:.1f}% on held-out conditions",
     "score_s": "race score (usual and held-out) {:.2f} s",
 }
 
