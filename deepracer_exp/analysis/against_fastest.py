@@ -56,7 +56,10 @@ def question_of(view: LogView, folder: Path) -> Question | None:
 
 @once_per_view
 def loss(view: LogView, folder: Path) -> Loss | None:
-    """Compare the run's fastest exploring lap from the start line; None without one, or without a fastest lap."""
+    """Compare the run's fastest exploring lap from the start line, by a car on usual conditions, with the fastest lap.
+
+    None: there is no such lap, or the fastest lap is not known.
+    """
     try:
         question = question_of(view, folder)
     except BadInput:
@@ -93,8 +96,9 @@ def by_cause(lap: pd.DataFrame, fastest: pd.DataFrame) -> pd.DataFrame:
 
 
 def _lap_from_the_line(view: LogView, fastest: FastestLap) -> pd.DataFrame | None:
-    """Return time and place at each step of the fastest lap that begins where the fastest of the car begins."""
-    laps = view.episodes[view.episodes["lap_time_s"].notna()].sort_values("lap_time_s", kind="stable")
+    """Return time and place at each step of the fastest lap `on_usual` that begins where the car's fastest begins."""
+    laps = view.episodes[view.on_usual & view.episodes["lap_time_s"].notna()]
+    laps = laps.sort_values("lap_time_s", kind="stable")
     start = np.array([fastest.column("x_m")[0], fastest.column("y_m")[0]])
     columns = ("X", "Y", "lap_clock_s")
     for episode in laps["episode"]:

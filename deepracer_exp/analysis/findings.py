@@ -159,7 +159,7 @@ def _chance(view: LogView, target_s: float | None) -> Finding | None:
         )
         return Finding("chance", sentence, {"laps": laps, "best_s": best_s}, {"least_laps": LEAST_LAPS})
     complete, sd_s = laps / len(episodes), float(laps_s.std(ddof=1))
-    share = f"{complete:.0%} of the episodes were complete laps."
+    share = f"{complete:.0%} of these episodes were complete laps."
     if view.laps_only:
         share = "Other episodes are not in the trace (trace=laps)."
     driven = count(laps, f"complete {view.lap_word}")

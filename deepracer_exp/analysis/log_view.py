@@ -210,17 +210,35 @@ class LogView:
     def now(self, least_laps: int = 0) -> tuple[pd.DataFrame, str]:
         """Return the finished episodes that represent the present policy, and their description.
 
-        They are those of the last third of the iterations, or of all if that has fewer than `least_laps` complete laps.
+        They are those of the last third of the iterations, or of all if that has fewer than `least_laps` complete laps;
+        with `least_laps` those `on_usual` conditions alone, because lap times of cars that differ do not compare.
         """
         ended = self.episodes["ended"].to_numpy(bool)
         if not self.trained:
             return self.episodes[ended], "in the evaluations"
+        alike = ""
+        if least_laps and not self.on_usual.all():
+            ended, alike = ended & self.on_usual, " on usual conditions"
         third = thirds(self.episodes["iteration"].to_numpy()) == 2
         late = self.episodes[ended & third]
         if late["lap_time_s"].notna().sum() < least_laps:
-            return self.episodes[ended], "in the traces" if self.untraced else "in the training"
+            return self.episodes[ended], f"in the {'traces' if self.untraced else 'training'}{alike}"
         begin = self.episodes["iteration"][third].min()
-        return late, f"since iteration {begin}{' of the traces' * bool(self.untraced)}"
+        return late, f"since iteration {begin}{' of the traces' * bool(self.untraced)}{alike}"
+
+    @cached_property
+    def on_usual(self) -> NDArray[np.bool_]:
+        """Whether each of `episodes` was driven on usual conditions; all of them where cars do not differ in that."""
+        usual = None if self.run is None or not self.trained else self.run.usual_episodes
+        if usual is None:
+            return np.ones(len(self.episodes), bool)
+        return np.isin(self.episodes["episode"].to_numpy(), usual)
+
+    @cached_property
+    def comparable(self) -> pd.DataFrame:
+        """Episodes whose laps compare: those `on_usual`, or all where fewer than two of these are laps."""
+        alike = self.episodes[self.on_usual]
+        return alike if alike["lap_time_s"].notna().sum() >= 2 else self.episodes
 
     def of_episodes(self, wanted: NDArray[np.bool_], *columns: str) -> pd.DataFrame:
         """Return columns of the driven rows of the wanted episodes, (n,) in the order of `episodes`."""

@@ -308,7 +308,11 @@ def _reliable_checkpoint(view: LogView, judged: Overfitting) -> str | None:
 
 @once_per_view
 def _slower(view: LogView) -> SlowerLaps | None:
-    return slower_laps(view.judged)
+    judged = view.judged
+    if not view.on_usual.all():  # slower cars complete their first laps later
+        laps_s = view.episodes[view.on_usual].groupby("iteration")["lap_time_s"].mean()
+        judged = judged.assign(lap_time_mean_s=judged["iteration"].map(laps_s))
+    return slower_laps(judged)
 
 
 def _laps_slower(view: LogView) -> Finding | None:

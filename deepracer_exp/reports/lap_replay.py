@@ -87,17 +87,17 @@ def laps_of_log(view: LogView, rival: LogView | None) -> list[ReplayedLap]:
         raise BadInput(
             view.name, "has one complete lap only", "another run or log beside it to replay against"
         )
-    fastest = int(view.episodes["lap_time_s"].idxmin())
-    return [first, _lap(view, ordinary_lap(view.episodes, fastest), "an ordinary lap")]
+    fastest = int(view.comparable["lap_time_s"].idxmin())
+    return [first, _lap(view, ordinary_lap(view.comparable, fastest), "an ordinary lap")]
 
 
 def fastest_lap_of_log(view: LogView, beside: ReplayedLap | None = None) -> ReplayedLap:
-    """Return the fastest complete lap of a log; of those that began where the lap beside it did, if there are any.
+    """Return the fastest `LogView.comparable` lap; of those that began where the lap beside it did, if there are any.
 
     Raises:
         BadInput: it has none with its steps, or its track is unknown.
     """
-    laps = view.episodes["lap_time_s"].dropna()
+    laps = view.comparable["lap_time_s"].dropna()
     if not len(laps):
         raise BadInput(view.name, "has no complete lap with its steps", "a run or log with laps")
     if beside is not None:

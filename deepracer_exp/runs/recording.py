@@ -3,7 +3,7 @@
 import contextlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from deepracer_exp.aws.logs import sim_trace
@@ -26,7 +27,7 @@ from deepracer_exp.aws.logs.recording import (
 )
 from deepracer_exp.aws.models.model_metadata import ModelMetadata
 from deepracer_exp.config.custom_files import SAC_TAKEN, TAKEN
-from deepracer_exp.config.driving import ActionSpaceConfig
+from deepracer_exp.config.driving import OFF, ActionSpaceConfig
 from deepracer_exp.config.race import RaceConfig
 from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.env.placement import PlacedOthers, read_placements
@@ -64,10 +65,7 @@ CONTROL_PERIOD_S = 1 / 15
 EVALUATION_COLUMNS: Mapping[str, tuple[str, str]] = {
     "iteration": ("int32", "policy update after which the policy was evaluated, counted as in the steps"),
     "completion": ("float64", "per cent of the lap, mean over the trials"),
-    "held_out_completion": (
-        "float64",
-        "the same on conditions held out of the training; NaN where not evaluated",
-    ),
+    "held_out_completion": ("float64", "the same on held-out conditions; NaN where not evaluated"),
     "lap_share": ("float64", "complete laps as a share of those tried; NaN where not known"),
     "laps": ("float64", "complete laps; NaN where not known"),
     "laps_tried": ("float64", "laps tried; NaN where not known"),
@@ -117,6 +115,8 @@ class RunRecording:
     """The decision of the stopping rule that ended the run, as in summary.json; None if no rule did."""
     randomized: bool = False
     """Whether its training varied the conditions (`randomization`)."""
+    usual_episodes: NDArray[np.int64] | None = None
+    """Episodes on usual conditions, where only a share of the cars differed from them; None: all were alike."""
     counted: pd.DataFrame | None = None
     """Results of all episodes by iteration, `COUNTED_COLUMNS`, where the trace has complete laps only."""
     others: PlacedOthers | None = None
@@ -163,6 +163,7 @@ def read_run_recording(folder: Path) -> RunRecording:
     problems: list[LogProblem] = []
     files: list[Path] = []
     steps = _steps(folder, problems, files)
+    traces = tuple(files)
     config = _config(folder, problems, files)
     updates, evaluated, counted = _metrics(folder, problems, files)
     if laps_only := config.get("trace") == "laps":
@@ -187,6 +188,7 @@ def read_run_recording(folder: Path) -> RunRecording:
         stopping=config.get("stopping"),
         decision=_decision(folder),
         randomized=is_randomized(config),
+        usual_episodes=_usual_episodes(traces, config, problems),
         counted=counted if laps_only else None,
         others=_others(folder, config, problems),
     )
@@ -277,6 +279,28 @@ def _config(folder: Path, problems: list[LogProblem], files: list[Path]) -> Mapp
         return {}
     files.append(file)
     return config
+
+
+def _usual_episodes(
+    traces: Sequence[Path], config: Mapping[str, Any], problems: list[LogProblem]
+) -> NDArray[np.int64] | None:
+    """Return the episodes of the cars that `car_share` leaves as they are; None: there are none, or no others."""
+    randomization = config.get("randomization") or {}
+    varied = [name for name, off in OFF.items() if randomization.get(name, [off, off]) != [off, off]]
+    if randomization.get("car_share", 1) in (0, 1) or not varied:
+        return None
+    # A quantity with whole numbers may be drawn as if it were off.
+    quantity = min(varied, key=lambda name: name == "action_delay_steps")
+    usual: list[NDArray[np.int64]] = [np.zeros(0, np.int64)]
+    for path in traces:
+        try:
+            with open_trace_file(path) as file:
+                episode, drawn = (stored_values(stored_column(file, name)) for name in ("episode", quantity))
+        except UNREADABLE as error:
+            problems.append(LogProblem(str(path), None, f"{quantity} left out: {_one_line(error)}"))
+            continue
+        usual.append(np.unique(episode[drawn == OFF[quantity]]))
+    return np.concatenate(usual)
 
 
 def _metrics(

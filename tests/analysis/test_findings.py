@@ -15,7 +15,7 @@ from deepracer_exp.analysis.findings import findings
 from deepracer_exp.analysis.log_tables import NONE, best_laps, headline, iteration_rows
 from deepracer_exp.analysis.log_view import LEAST_EPISODES, LogView, prepare
 from deepracer_exp.analysis.off_track import neighbours
-from deepracer_exp.analysis.sectors import sectors_of
+from deepracer_exp.analysis.sectors import sectors_now, sectors_of
 from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.reports.log_report import LogPage, draw_sections, html
@@ -327,6 +327,25 @@ def test_the_chance_of_a_lap_is_measured_and_fitted_on_the_laps_of_the_last_thir
     assert "2 of 6 complete exploring laps since iteration 2 took at most 7.15 s" in found.sentence
     assert (found.values["low"], found.values["high"]) == pytest.approx((0.0968, 0.7), abs=1e-3)
     assert found.values["normal"] == pytest.approx(0.303, abs=0.001)
+
+
+def test_lap_times_of_cars_that_differ_are_not_compared() -> None:
+    drives = [Drive(speed_mps=v, iteration=k) for k in range(9) for v in (3.0, 2.0, 3.2, 5.0)]
+    alike = prepare(made_up_recording(drives))
+    usual = alike.episodes["episode"].to_numpy()[::2]
+    view = prepare(run_of(alike, usual_episodes=usual))
+    chance = of(view, "chance")
+    assert chance.values["laps"] == 6
+    assert chance.values["best_s"] == pytest.approx(Drive(speed_mps=3.2).lap_time_s())
+    assert "since iteration 6 on usual conditions took" in chance.sentence
+    assert "100% of these episodes were complete laps" in chance.sentence
+    assert of(alike, "chance").values["laps"] == 12
+    lost = sectors_now(view, COURSE)[1].sum(axis=1)
+    assert (lost.min(), lost.max()) == pytest.approx([Drive(speed_mps=v).lap_time_s() for v in (3.2, 3.0)])
+    # Episodes on other conditions count in all that does not compare lap times.
+    assert len(view.now()[0]) == 12
+    few = prepare(run_of(alike, usual_episodes=usual[:1]))
+    assert len(few.comparable) == len(few.episodes) == len(drives)
 
 
 def test_without_a_lap_there_is_no_chance_and_few_say_little() -> None:

@@ -8,6 +8,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
+import yaml
 
 from deepracer_exp.aws.logs.recording import (
     METRICS_COLUMNS,
@@ -112,6 +113,26 @@ def test_a_file_of_the_trace_that_cannot_be_read_is_left_out_and_reported(folder
     assert problem.file == str(file)
     assert problem.reason.startswith("left out: ")
     assert file not in recording.files
+
+
+def test_episodes_on_usual_conditions_are_known_where_only_a_share_of_the_cars_differs(folder):
+    assert read_run_recording(folder).usual_episodes is None
+    usual = set()
+    for file in sorted((folder / "trace").glob("*-iteration.parquet")):
+        rows = pq.read_table(file).to_pandas()
+        rows["friction_scale"] = np.where(rows["episode"] % 3 == 0, 0.9, 1.0)
+        usual |= set(rows["episode"][rows["episode"] % 3 > 0])
+        pq.write_table(pa.Table.from_pandas(rows, pq.read_schema(file), preserve_index=False), file)
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    config["randomization"] |= {"action_delay_steps": [0, 2], "friction_scale": [0.7, 1.2]}
+    for share, known in ((0.5, True), (1, False), (0, False)):
+        config["randomization"]["car_share"] = share
+        (folder / "config.yaml").write_text(yaml.safe_dump(config))
+        log = read_run_recording(folder)
+        assert not log.recording.problems
+        assert (log.usual_episodes is not None) is known
+        if log.usual_episodes is not None:
+            assert set(log.usual_episodes) == usual
 
 
 def test_files_of_earlier_versions_which_have_no_decimals_are_read_beside_others(folder):

@@ -394,7 +394,7 @@ def against_fastest(view: LogView) -> Chart | None:
     lost = None if folder is None else loss(view, folder)
     if lost is None:
         return None
-    table = lost.by_sector
+    table, alike = lost.by_sector, "" if view.on_usual.all() else " on usual conditions"
     places, colors = np.arange(len(table)), dict(zip(CAUSES, (BLUE, ORANGE, VERMILION), strict=True))
     layers = [
         bars(places + 0.26 * (number - 1), table[cause].to_numpy(), colors[cause], cause, width=0.26)
@@ -403,7 +403,7 @@ def against_fastest(view: LogView) -> Chart | None:
     return Chart(
         name="against_fastest",
         title="Seconds lost to the fastest lap of this car",
-        caption=f"The fastest {view.lap_word} from the start line: {lost_in_words(lost)}. Line is a longer way, "
+        caption=f"The fastest {view.lap_word} from the start line{alike}: {lost_in_words(lost)}. Line is a longer way, "
         "steering the way that turning to and fro adds to it, speed the rest; below zero the lap gains. The fastest "
         "lap itself: `deepracer-exp tracks NAME --fastest`.",
         rows=[[Panel(layers=layers, y_label="seconds lost", x_names=list(table.index))]],

@@ -153,11 +153,11 @@ def lap_time_percentile(view: LogView) -> Chart | None:
 
 def lap_delta(view: LogView) -> Chart | None:
     """Draw the fastest lap beside an ordinary one, point by point along the course."""
-    laps = view.episodes["lap_time_s"].dropna().sort_values(kind="stable")
+    laps = view.comparable["lap_time_s"].dropna().sort_values(kind="stable")
     if len(laps) < 2:
         return None
     fastest = int(laps.index[0])
-    ordinary = ordinary_lap(view.episodes, fastest)
+    ordinary = ordinary_lap(view.comparable, fastest)
     delta = time_lost(view.steps, ordinary, fastest)
     unit, scale, sectors = "per cent", 100.0, []
     if view.course is not None:
