@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import textwrap
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,6 +29,12 @@ LINE_S = 5.0
 """Shortest time between two plain lines; from two minutes on it grows with the run, up to `_LINE_AT_MOST_S`."""
 _LINE_AT_MOST_S = 60.0
 _LINE_SHARE = 1 / 24
+_SPACE = "  "  # between the figures of a plain line
+_AT_MOST = "at most "
+LINE_COLUMNS = 120
+"""Columns that no plain line exceeds."""
+_DISPENSABLE = ("entropy", "return", "completion")
+"""What a plain line leaves out, first to last, where figures are so long that it exceeds its columns."""
 NOTHING = "\N{EN DASH}"
 
 _HALVES = 60  # columns from which the figures stand in two halves side by side
@@ -141,7 +148,10 @@ class ProgressDisplay:
         if self._live is not None:
             self._live.start(refresh=True)
         else:
-            self._print(f"{self._header.name}: {self._header} · {self._header.budget}")
+            for line in textwrap.wrap(
+                f"{self._header} · {self._header.budget}", LINE_COLUMNS, break_on_hyphens=False
+            ):
+                self._print(line)
             self._print(f"results in {self._header.folder}")
         return self
 
@@ -188,22 +198,22 @@ class ProgressDisplay:
         self._console.print(text, soft_wrap=True)
 
     def _line(self) -> str:
-        share = self._figure(_SHARE)
-        parts = [
-            f"{100 * self._fraction:3.0f}%",
-            f"iteration {self._figure('iteration')}",
-            f"{self._figure('env steps')} steps",
-            self._figure("speed").replace(" steps/s", "/s"),
-            f"return {self._figure('return')}",
-            f"completion {self._figure('completion')}",
-            f"usual lap {self._figure('usual lap')} ({self._figure(_COMPLETE)})",
-            f"exploring laps {self._figure('exploring laps')} ({share} of last {self._header.remembered})",
-            self._tracks.least() if self._tracks else f"their fastest {self._figure('their fastest')}",
-            f"entropy {self._figure('entropy')}",
-            f"lr {self._figure('learn rate')}",
-            _left(self._eta_s),
-        ]
-        return " · ".join(parts)
+        usual = f"lap {self._figure('usual lap')} ({self._figure(_COMPLETE)})"
+        parts = {
+            "iteration": f"iteration {self._figure('iteration')}",
+            "steps": f"{self._figure('env steps')} steps",
+            "speed": self._figure("speed").replace(" steps/s", "/s"),
+            "completion": f"completion {self._figure('completion', '.0f')}",
+            # The policy's laps are those of its evaluations; until the first, those of exploration show what it does.
+            "laps": usual if self._evaluated else f"exploring laps {self._figure('exploring laps')}",
+            "return": f"return {self._figure('return', ',.1f')}",
+            "entropy": f"entropy {self._figure('entropy', '.2f')}",
+            "left": _left(self._eta_s).removeprefix(_AT_MOST),
+        }
+        for label in _DISPENSABLE:
+            if len(_SPACE.join(parts.values())) > LINE_COLUMNS:
+                del parts[label]
+        return _SPACE.join(parts.values())
 
     def _panel(self) -> Panel:
         # On a wider terminal the halves would be too far apart to be read together.
@@ -275,7 +285,7 @@ class ProgressDisplay:
         cell.truncate(width, overflow="ellipsis", pad=True)
         return cell
 
-    def _figure(self, label: str) -> str:
+    def _figure(self, label: str, form: str | None = None) -> str:
         if label == _SHARE:
             share = _value(self._row, "lap_share")
             return NOTHING if share is None else f"{100 * share:.0f}%"
@@ -284,7 +294,7 @@ class ProgressDisplay:
             return NOTHING if tried is None else f"{laps} of {tried}"
         key, spec, unit = _FIGURES[label]
         value = _value(self._evaluated if key.startswith("eval_") else self._row, key)
-        return NOTHING if value is None else format(value, spec) + unit
+        return NOTHING if value is None else format(value, form or spec) + unit
 
 
 class TrackTable:
@@ -310,13 +320,6 @@ class TrackTable:
                 value = _value(row, track_metric(metric, label))
                 if value is not None:
                     series[label] = value
-
-    def least(self) -> str:
-        """Name the track with the lowest completion."""
-        if not self._completion:
-            return f"least {NOTHING}"
-        label = min(self._completion, key=self._completion.__getitem__)
-        return f"least {self._completion[label]:.1f}% on {label}"
 
     def lines(self, width: int, room: int) -> list[Text]:
         """Return the table, tracks running down its columns.
@@ -382,4 +385,4 @@ def _clock(seconds: float) -> str:
 def _left(eta_s: float | None) -> str:
     if eta_s is None or not math.isfinite(eta_s):
         return f"{NOTHING} left"
-    return f"at most {_clock(max(eta_s, 0.0))} left"  # the last iteration may end past the budget
+    return f"{_AT_MOST}{_clock(max(eta_s, 0.0))} left"  # the last iteration may end past the budget

@@ -3,10 +3,14 @@
 import io
 from types import SimpleNamespace
 
+from hypothesis import given
+from hypothesis import strategies as st
+
 from deepracer_exp.commands.output import plain_console
 from deepracer_exp.sweeps.queue.claims import Claim
 from deepracer_exp.sweeps.report.view import SweepView
 from deepracer_exp.sweeps.trial import SeedRun, Trial
+from deepracer_exp.training.display import LINE_COLUMNS
 
 CONFIG = SimpleNamespace(trials=4, objectives=("race_score",))
 WORKER_CONFIG = SimpleNamespace(study="spring", config=CONFIG, folder="runs/spring")
@@ -51,7 +55,7 @@ def test_it_counts_trials_by_state_and_names_the_best():
     view = shown([*ENDED, claim(2)])
     for words in (
         "2 of 4: 1 done, 1 pruned, 0 failed",
-        "trial 0, race score (usual and held-out) 8.25 s on the sweep's laps",
+        "trial 0, race score (usual and held-out) 8.25 s, mean usual lap 8.10 s, 98% driven",
         "8,192",
         "51%",
     ):
@@ -82,26 +86,48 @@ def test_before_the_first_trial_it_says_that_workers_start():
 
 def test_without_a_terminal_each_trial_that_ends_is_a_line():
     lines = shown(ENDED, is_terminal=False).splitlines()
-    assert lines[0] == "spring: 4 trials, 2 workers; runs in runs/spring"
-    assert lines[1].startswith(
-        "trial 0 done (converged) after 8,192 steps: race score (usual and held-out) 8.25 s on the sweep's laps ("
+    assert lines[:2] == ["spring: 4 trials, 2 workers", "runs in runs/spring"]
+    said = " ".join(map(str.strip, lines[2:]))
+    assert (
+        "left: trial 0 done (converged) after 8,192 steps: race score (usual and held-out) 8.25 s, "
+        "mean usual lap 8.10 s, 98% driven" in said
     )
-    assert lines[2].startswith(
-        "trial 1 pruned (collapsed) after 4,096 steps: collapsed: entropy 0.01; 2 of 4, about"
+    assert "left: trial 1 pruned after 4,096 steps: collapsed: entropy 0.01" in said
+    assert said.count("2 of 4, about") == 2
+
+
+@given(
+    st.dictionaries(
+        st.text("abc_.", min_size=1, max_size=60), st.floats() | st.text("xyz-", max_size=40), max_size=12
+    ),
+    st.text("abc ", max_size=500),
+)
+def test_no_line_of_a_trial_is_wider_than_120_columns_and_none_of_its_values_is_lost(params, reason):
+    many = {f"key{number}.{key}": value for number, (key, value) in enumerate(params.items())}
+    names = ("race_score", "lap_time", "completion", "zigzag")
+    config = SimpleNamespace(
+        study="spring", config=SimpleNamespace(trials=4, objectives=names), folder="runs"
     )
-    assert len(lines) == 3
+    ended = [
+        claim(0, "COMPLETE", [108.25, 108.1, 100.0, 10.0], ending="converged", completion=100.0, params=many),
+        claim(1, "FAIL", None, ending="failed", reason=reason, params=many),
+    ]
+    text = io.StringIO()
+    with SweepView(config, 2, plain_console(file=text, width=80)) as view:
+        view.show([])
+        view.show(ended)
+    assert max(map(len, text.getvalue().splitlines())) <= LINE_COLUMNS == 120
+    squeezed = "".join(text.getvalue().split())
+    assert "".join(reason.split()) in squeezed
+    assert all("".join(key.rpartition(".")[2].split()) in squeezed for key in many)
 
 
 def test_without_held_out_laps_the_race_score_is_that_of_the_usual_ones():
     ended = claim(0, "COMPLETE", [8.25], completion=98.0)
-    assert "race score (usual) 8.25 s on the sweep's laps" in shown([ended], is_terminal=False)
+    assert "race score (usual) 8.25 s" in shown([ended], is_terminal=False)
 
 
 def test_values_keep_their_brackets():
     ended = claim(0, "COMPLETE", [8.25], params={"track": "[reinvent_base]"}, completion=98.0)
-    assert (
-        shown([ended], is_terminal=False)
-        .splitlines()[1]
-        .startswith("trial 0 with track [reinvent_base] done")
-    )
+    assert "track [reinvent_base]" in shown([ended], is_terminal=False)
     assert "track [bold]" in shown([claim(1, params={"track": "[bold]"})])

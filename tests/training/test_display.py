@@ -10,8 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from deepracer_exp.aws.worlds.catalogue import worlds
 from deepracer_exp.commands.output import plain_console
 from deepracer_exp.training.display import (
+    LINE_COLUMNS,
     LINE_S,
     NOTHING,
     SPARKS,
@@ -114,7 +116,8 @@ def test_the_lap_of_the_last_evaluation_stays_and_is_not_mixed_with_exploring_on
         assert "complete 7 of 8" in panel
         assert "their fastest 9.33 s" in panel
     line = lines(lambda display, clock: [display.update(*one) for one in updates])[-1]
-    assert "usual lap 8.76 s (7 of 8) · exploring laps 525 (96% of last 20) · their fastest 9.33 s" in line
+    assert "lap 8.76 s (7 of 8)" in line
+    assert "exploring" not in line
 
 
 @pytest.mark.parametrize("missing", [None, math.nan, math.inf])
@@ -139,8 +142,10 @@ def test_without_a_terminal_there_are_single_plain_lines():
     assert HEADER.actions in written[0]  # square brackets are text, not markup
     assert HEADER.folder in written[1]
     assert "\x1b" not in "".join(written)
-    words = ["67%", "655,360 steps", "15,096/s", "82.58", "99.5%", "525", "96%", "9.33 s", "0:23 left"]
-    assert not [word for word in words if word not in written[2]]
+    assert written[2] == (
+        "iteration 40  655,360 steps  15,096/s  completion 100%  exploring laps 525  return 82.6  entropy 1.54  "
+        "0:23 left"
+    )
 
 
 def test_the_time_on_a_terminal_moves_while_an_iteration_takes_long(monkeypatch):
@@ -179,15 +184,46 @@ def test_plain_lines_come_at_a_limited_rate_and_the_last_row_is_never_lost():
     assert 60 < len(lines(act_for_an_hour)) < 130  # a line a minute
 
 
-def test_a_plain_line_names_the_track_on_which_the_car_comes_least_far():
-    def act(display: ProgressDisplay, clock: Clock) -> None:
-        display.update({**ROW_OF_TRACKS, "completion/track_h": 12.34}, 0.5, 23.0)
-        clock.now_s += 2 * LINE_S
-        # Nothing ended there in this iteration: what was known of it holds.
-        display.update({**ROW_OF_TRACKS, "completion/track_h": None}, 0.6, 20.0)
+NUMBERS = {
+    "iteration": st.integers(1, 99_999),
+    "env_steps": st.integers(1, 10**10),
+    "env_steps_per_s": st.floats(0.1, 1e6),
+    "completion": st.floats(0, 100),
+    "laps": st.integers(0, 10**7),
+    "mean_return": st.floats(-1e6, 1e6),
+    "entropy": st.floats(-99, 99),
+    "lr": st.floats(1e-9, 1),
+    "eval_lap_share": st.sampled_from([None, 1.0]),
+    "eval_lap_time_s": st.floats(1, 1000),
+    "eval_laps": st.integers(0, 1000),
+    "eval_laps_tried": st.integers(0, 1000),
+}
+LONGEST = sorted((world.title for world in worlds().values()), key=len)[-3:]
 
-    assert "least 12.3% on track_h" in lines(act, SEVERAL)[-1]
-    assert "their fastest" not in lines(act, SEVERAL)[-1]
+
+def test_a_plain_line_of_a_long_training_names_all_that_a_racer_follows():
+    row = {"iteration": 183, "env_steps": 2_998_272, "env_steps_per_s": 58_400.0, "completion": 100.0}
+    row |= {"eval_lap_share": 1.0, "eval_lap_time_s": 12.34, "eval_laps": 8, "eval_laps_tried": 8}
+    row |= {"mean_return": 182.58, "entropy": -1.538}
+    line = lines(lambda display, clock: display.update(row, 0.9, 61.0))[-1]
+    assert line == (
+        "iteration 183  2,998,272 steps  58,400/s  completion 100%  lap 12.34 s (8 of 8)  return 182.6  "
+        "entropy -1.54  1:01 left"
+    )
+
+
+@given(
+    st.fixed_dictionaries(NUMBERS),
+    st.floats(0, 1e6),
+    st.sampled_from(["PPO, compiled", "SAC, torch"]),
+    st.sampled_from([LONGEST[-1], " + ".join(LONGEST), "82 tracks"]),
+)
+def test_no_plain_line_is_wider_than_120_columns(row, left_s, algorithm, track):
+    header = dataclasses.replace(HEADER, track=track, algorithm=algorithm, track_labels=("a", "b"))
+    written = lines(lambda display, clock: display.update(row, 0.5, left_s), header)
+    assert max(map(len, written)) <= LINE_COLUMNS == 120
+    assert f"iteration {row['iteration']:,}" in written[-1]
+    assert "left" in written[-1]
 
 
 @given(st.lists(st.floats(-1e6, 1e6), max_size=300), st.integers(1, 40))

@@ -1,6 +1,7 @@
 """The live view of a sweep in a terminal, and plain lines where there is none."""
 
 import collections
+import textwrap
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any, Self
@@ -13,12 +14,11 @@ from rich.table import Table
 from rich.text import Text
 
 from deepracer_exp.errors import count
-from deepracer_exp.runs.result import SWEEP_LAPS
 from deepracer_exp.sweeps.queue.claims import Claim
 from deepracer_exp.sweeps.queue.worker_config import WorkerConfig
-from deepracer_exp.sweeps.search.objectives import NONE, cost, shown_values
+from deepracer_exp.sweeps.search.objectives import NONE, cost, shown, shown_values
 from deepracer_exp.sweeps.trial import Trial
-from deepracer_exp.training.display import sparkline
+from deepracer_exp.training.display import LINE_COLUMNS, sparkline
 
 from .labels import duration, ending_words, parameter, short_keys
 
@@ -51,7 +51,8 @@ class SweepView:
             self._live.start()
         else:
             trials, workers = count(self._sweep.trials, "trial"), count(self._workers, "worker")
-            self.say(f"{self._study}: {trials}, {workers}; runs in {self._folder}")
+            self.say(f"{self._study}: {trials}, {workers}")
+            self._console.print(f"runs in {self._folder}", soft_wrap=True)  # a path is not folded
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -66,15 +67,19 @@ class SweepView:
         for claim in claims:
             self._follow(claim)
             if self._live is None and claim.trial.number in ended - self._printed:
+                left = f", {self._left(claims)}" if len(ended) < self._sweep.trials else ""
                 line = _sentence(claim, self._sweep.objectives)
-                self.say(f"{line}; {len(ended)} of {self._sweep.trials}, {self._left(claims)}")
+                self.say(f"{len(ended)} of {self._sweep.trials}{left}: {line}")
+                if params := _params(claim):
+                    self.say(f"  {params}")
         self._printed |= ended
         if self._live is not None:
             self._live.update(self._panel(claims, stage), refresh=True)
 
     def say(self, text: str) -> None:
-        """Print a line, above the panel where there is one."""
-        self._console.print(text, soft_wrap=True)
+        """Print a text, above the panel where there is one, in lines of at most `LINE_COLUMNS`."""
+        lines = textwrap.wrap(text, LINE_COLUMNS, subsequent_indent="  ", break_on_hyphens=False)
+        self._console.print("\n".join(lines), soft_wrap=True)
 
     def _follow(self, claim: Claim) -> None:
         completion = claim.progress.get("completion")
@@ -159,14 +164,21 @@ def _best(claims: Sequence[Claim], objectives: Sequence[str]) -> str:
 
 
 def _values(trial: Trial, objectives: Sequence[str]) -> str:
-    lap = "no lap" if trial.lap_time_s is None else f"mean usual lap {trial.lap_time_s:.2f} s"
-    values = shown_values(objectives, trial.values or (), trial.held_out_completion is not None)
-    return f"{values} on {SWEEP_LAPS} ({lap}, {trial.completion:.0f}% driven)"
+    """Return the values of a trial, and lap and completion where they are no objectives."""
+    parts = [shown_values(objectives, trial.values or (), trial.held_out_completion is not None)]
+    if "lap_time" not in objectives:
+        parts.append(
+            "no lap" if trial.lap_time_s is None else f"mean usual lap {shown('lap_time', trial.lap_time_s)}"
+        )
+    if "completion" not in objectives:
+        parts.append(f"{trial.completion:.0f}% driven")
+    return ", ".join(parts)
 
 
 def _sentence(claim: Claim, objectives: Sequence[str]) -> str:
     trial = claim.trial
-    end = _values(trial, objectives) if trial.values else trial.reason
-    values = f" with {params}" if (params := _params(claim)) else ""
     state, ending = _STATES[trial.state], ending_words(trial.ending)
-    return f"trial {trial.number}{values} {state} ({ending}) after {trial.env_steps:,} steps: {end}"
+    end = _values(trial, objectives) if trial.values else trial.reason
+    # "done (finished)" and "pruned (collapsed) ...: collapsed: ..." say one thing twice.
+    how = "" if ending in ("finished", state) or end.startswith(ending) else f" ({ending})"
+    return f"trial {trial.number} {state}{how} after {trial.env_steps:,} steps: {end}"
