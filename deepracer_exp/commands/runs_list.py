@@ -174,10 +174,12 @@ def _print_table(rows: "Sequence[Row]") -> None:
     from deepracer_exp.runs.labels import USER_TAG
     from deepracer_exp.runs.result import TRAINING_LAPS
 
+    console = table_console()
     table = Table("run", "state", box=None, pad_edge=False, header_style="dim")
     table.columns[0].overflow = "fold"
     for name in ("lap (s)", "race score (s)", "exploring laps", "fastest of them (s)", "age"):
-        table.add_column(name, justify="right")
+        # With heads of two lines the names of runs fit a terminal of 120 columns.
+        table.add_column(name.replace(" ", "\n", 1) if console.is_terminal else name, justify="right")
     several = len({row["user"] for row in rows}) > 1
     labelled = [key for key in _columns(rows) if key in ("name", "note") or key.startswith(USER_TAG)]
     shown = [*["user"] * several, *(key for key in labelled if any(row.get(key) for row in rows))]
@@ -196,7 +198,6 @@ def _print_table(rows: "Sequence[Row]") -> None:
             _age((now - began).total_seconds()),
             *(str(row.get(key) or "") for key in shown),
         )
-    console = table_console()
     console.print(table)
     if any(row["lap_s"] is not None for row in rows):
         console.print(
