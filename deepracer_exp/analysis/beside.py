@@ -29,7 +29,7 @@ def evaluated_in_training(view: LogView) -> str:
     """Return the evaluation of a training's best checkpoint in words; "" without one."""
     if view.run is not None:
         best = view.run.best
-        return "" if best.iteration is None else f"{best.iteration:06d}: {best.words()}"
+        return "" if best.iteration is None else f"checkpoint {best.iteration}: {best.words()}"
     completion = view.iterations["eval_completion"]
     if not completion.notna().any():
         return ""

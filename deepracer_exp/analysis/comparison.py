@@ -30,7 +30,7 @@ RESULTS: tuple[tuple[str, str, str, int], ...] = (
     ("end", "end", "{}", 0),
     ("control steps", "last env_steps", "{:,.0f}", 0),
     ("minutes", "minutes", "{:.1f}", 0),
-    ("best checkpoint", "iteration", "{:06d}", 0),
+    ("best checkpoint", "iteration", "{:d}", 0),
     *FIGURES,
     ("exploring laps", "last laps", "{:,.0f}", 1),
     ("exploring completion, %", "last completion", "{:.1f}", 1),

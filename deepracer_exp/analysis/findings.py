@@ -48,8 +48,8 @@ def _race_with(best: RunResult) -> Finding:
         )
         return Finding("submit", sentence, to_do=sentence)
     values: Numbers = {"iteration": best.iteration, "by": best.criterion}
-    sentence = f"The best checkpoint by {best.criterion} is {best.iteration:06d}: {best.words()}."
-    to_do = f"Race with checkpoint {best.iteration:06d}, the best by {best.criterion}: {best.words()}."
+    sentence = f"The best checkpoint by {best.criterion} is checkpoint {best.iteration}: {best.words()}."
+    to_do = f"Race with checkpoint {best.iteration}, the best by {best.criterion}: {best.words()}."
     return Finding("submit", sentence, values, to_do=to_do)
 
 

@@ -303,7 +303,7 @@ def _reliable_checkpoint(view: LogView, judged: Overfitting) -> str | None:
     chosen = best if best in there else max(there)
     completion = float(sure.set_index("iteration").loc[chosen, column])
     which = "the best" if chosen == best else "an earlier one"
-    return f"checkpoint {chosen:06d}, {which}, whose {judged.evaluated} completed {completion:.0f}%"
+    return f"checkpoint {chosen}, {which}, whose {judged.evaluated} completed {completion:.0f}%"
 
 
 @once_per_view
@@ -332,7 +332,7 @@ def _instead(view: LogView) -> str:
         best = view.run.best
         if best.iteration is None:
             return "one of the kept checkpoints"
-        return f"checkpoint {best.iteration:06d} (the best by {best.criterion})"
+        return f"checkpoint {best.iteration} (the best by {best.criterion})"
     if not len(view.candidates):
         return "an earlier checkpoint"
     first = view.candidates.iloc[0]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from deepracer_exp.cache import compiled_folder
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.runs.files import BEST_LAP, CHECKPOINTS, LEARNING, METRICS, REPORT, full_name, read_metrics
-from deepracer_exp.runs.result import FAILED, RELIABLE, TRAINING_LAPS, fastest_reliable, why_not_fastest
+from deepracer_exp.runs.result import FAILED, RELIABLE, fastest_reliable, why_not_fastest
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -146,9 +146,9 @@ def print_result(outcome: "TrainResult", tracking: "TrackingConfig") -> None:
     result = result_of(summary)
     if result is not None and result.evaluated:
         several = ", mean of the laps on all tracks" * ("tracks" in summary)
-        print(f"\n  fastest reliable lap: {_reliable_lap(outcome.folder)}{several}")
-        best = f"best checkpoint in {TRAINING_LAPS} by {result.criterion}"
-        print(f"  {best}: {result.iteration:06d}, {result.words()}")
+        print(f"\n  best by {result.criterion}: checkpoint {result.iteration}")
+        print(f"    {result.words()}")
+        print(f"  fastest reliable lap: {_reliable_lap(outcome.folder)}{several}")
         if (why := why_not_fastest(result, read_metrics(outcome.folder / METRICS))) is not None:
             print(f"    {why}")
     print(f"\n  results       {outcome.folder}")

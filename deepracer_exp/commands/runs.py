@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 _MOST_CHANGES = 6
 """Changes of a clone that its lineage shows."""
+_LINEAGE_COLUMNS = 120
+"""Width of a family tree where there is no terminal."""
 _EPILOG = """\
   deepracer-exp runs                                        list the runs, newest first
   deepracer-exp runs lineage RUN
@@ -146,7 +148,7 @@ def with_default_action(arguments: list[str]) -> list[str]:
 
 
 def _lineage(args: argparse.Namespace) -> int:
-    from rich.table import Table
+    from rich.padding import Padding
     from rich.tree import Tree
 
     from deepracer_exp.runs.lineage import best_by_generation, best_members, family
@@ -162,28 +164,30 @@ def _lineage(args: argparse.Namespace) -> int:
             grow(child, tree.add(_label(child, run, best)))
         return tree
 
-    console = table_console()
-    table = Table(box=None, show_header=False, pad_edge=False)
+    console = table_console(_LINEAGE_COLUMNS)
     fastest = best_by_generation(root)
     courses = len({member.course for _, member, _ in fastest}) > 1
-    for generation, member, result in fastest:
-        course = [member.course] if courses else []
-        table.add_row(f"generation {generation}", *course, result.words(), full_name(member.path))
     with console.capture() as drawn:
         console.print(grow(root, Tree(_label(root, run, best))))
         if fastest:
-            table.columns[-1].overflow = "fold"
-            console.print("", table, sep="\n")
+            console.print()
+        for generation, member, result in fastest:
+            course = f" on {member.course}" * courses
+            console.print(
+                f"best of generation {generation}{course}: {full_name(member.path)}", soft_wrap=True
+            )
+            console.print(Padding(result.words(), (0, 0, 0, 2)))
     # Rich fills lines up to the width.
     console.file.write("".join(f"{line.rstrip()}\n" for line in drawn.get().splitlines()))
     return 0
 
 
 def _label(member: "FamilyMember", run: Path, best: dict[int, str]) -> "Text":
-    """Return two lines: the run with its result, and its changes."""
+    """Return lines on a run: its name, where it comes from, what it achieved, and what it changed."""
     from rich.text import Text
 
     from deepracer_exp.analysis.comparison import value_text
+    from deepracer_exp.runs.checkpoint_files import checkpoint_words
 
     asked_for = member.path == run.resolve()
     label = Text(
@@ -195,14 +199,17 @@ def _label(member: "FamilyMember", run: Path, best: dict[int, str]) -> "Text":
         label.append(f"  * {best[id(member)]}", style="not reverse bold green")
     facts = [f"generation {member.generation}"]
     if member.lineage is not None:
-        facts += [f"from {member.lineage.checkpoint}", *filter(None, [member.lineage.registered])]
+        facts += [
+            f"from {checkpoint_words(member.lineage.checkpoint)}",
+            *filter(None, [member.lineage.registered]),
+        ]
     if member.record is None:
         facts.append("missing: its folder was removed")
     elif (status := member.record.summary.get("status", "running or killed")) != "finished":
         facts.append(str(status))
-    if member.result is not None:
-        facts.append(member.result.words())
     label.append("\n" + ", ".join(facts), style="not reverse not bold")
+    if member.result is not None:
+        label.append("\n" + member.result.words(), style="not reverse not bold")
     texts = [
         [f"{value:g}" if isinstance(value, float) else value_text(value, 32) for value in both]
         for both in member.changes.values()
@@ -249,7 +256,7 @@ def _promote(args: argparse.Namespace) -> int:
     )
     print(f"{registered}: version {registered.version}")
     print(f"  run         {run.path}")
-    print(f"  checkpoint  {registered.checkpoint}, sha256 {registered.sha256[:12]}")
+    print(f"  checkpoint  {int(registered.checkpoint)}, sha256 {registered.sha256[:12]}")
     print(f"\n  race it     {command_line('evaluate', str(registered), config, OF_POLICY)}")
     return 0
 
@@ -317,6 +324,7 @@ def _show_removable(items: "Sequence[Removable]", runs_dir: Path, console: "Cons
     from rich.filesize import decimal
     from rich.table import Table
 
+    from deepracer_exp.runs.checkpoint_files import checkpoint_number
     from deepracer_exp.runs.clean import SPARE_CHECKPOINTS, total_bytes
 
     if not items:
@@ -324,7 +332,7 @@ def _show_removable(items: "Sequence[Removable]", runs_dir: Path, console: "Cons
     table = Table("size", "what", "run", box=None, pad_edge=False)
     table.columns[0].justify = "right"
     for item in items:
-        what, names = item.what, [path.name for path in item.paths]
+        what, names = item.what, [checkpoint_number(path.name) for path in item.paths]
         if what == SPARE_CHECKPOINTS:
             shown = ", ".join(names) if len(names) <= 4 else f"{names[0]} to {names[-1]} ({len(names)})"
             what += f": {shown}"

@@ -333,6 +333,7 @@ def _show_study(word: str, *arguments: str) -> int:
 
 
 def _print_best(study: "Study") -> None:
+    from deepracer_exp.runs.checkpoint_files import checkpoint_words
     from deepracer_exp.sweeps.report.best import best_line, best_shown, best_trial
     from deepracer_exp.sweeps.report.last_race import last_race, race_rows
     from deepracer_exp.sweeps.report.page import export_step, tried
@@ -351,5 +352,5 @@ def _print_best(study: "Study") -> None:
         print(
             f"  {row['name']:{width}}  mean usual lap {row['lap_time']}, laps complete: {row['laps']}{held_out}"
         )
-    print(f"\n  run     best:{study.study_name}, which is {first.run}, checkpoint {first.checkpoint}")
+    print(f"\n  run     best:{study.study_name}, which is {first.run}, {checkpoint_words(first.checkpoint)}")
     print(f"  export  {line}  # {what}")

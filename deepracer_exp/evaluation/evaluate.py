@@ -22,6 +22,7 @@ from deepracer_exp.env.head_to_head import HeadToHead
 from deepracer_exp.env.race import Race
 from deepracer_exp.errors import RunFailed, count, writing
 from deepracer_exp.files import atomic_write
+from deepracer_exp.runs.checkpoint_files import checkpoint_words
 from deepracer_exp.runs.checkpoints import StoredPolicy
 from deepracer_exp.runs.files import EVALUATIONS, FILMS
 from deepracer_exp.tracking.delivery import deliver_evaluation
@@ -191,7 +192,7 @@ def evaluate_run(
             on_step(race, protocol, acted)
 
     err.print(
-        f"{run.path.name}, checkpoint {stored.path.name}: {count(len(evaluator.trials), 'trial')}"
+        f"{run.path.name}, {checkpoint_words(stored.path.name)}: {count(len(evaluator.trials), 'trial')}"
         + _against(plan, rival, evaluator),
         soft_wrap=True,
     )
@@ -240,7 +241,7 @@ def evaluate_run(
 def _against(plan: EvaluatePlan, rival: StoredPolicy | None, evaluator: Evaluator) -> str:
     """Name the policy's rival."""
     if plan.rival is not None and rival is not None:
-        return f" against {plan.rival.path.name}, checkpoint {rival.path.name}"
+        return f" against {plan.rival.path.name}, {checkpoint_words(rival.path.name)}"
     return " against itself" * isinstance(evaluator.race, HeadToHead)
 
 

@@ -40,6 +40,7 @@ from deepracer_exp.evaluation.race_protocol import RaceProtocol
 from deepracer_exp.evaluation.result import USUAL, Evaluation, number
 from deepracer_exp.files import atomic_write
 from deepracer_exp.reports.picture_changes import TriedPictures, pictures_sheet, try_pictures
+from deepracer_exp.runs.checkpoint_files import checkpoint_words
 from deepracer_exp.runs.files import FILMS
 from deepracer_exp.runs.result import RELIABLE
 
@@ -159,7 +160,7 @@ def check_run(plan: EvaluatePlan, picture: Path | None, out: Console, err: Conso
     archive = car_archive(stored.networks, experiment)
     torch.set_num_threads(1)
     policy = stored.networks.policy
-    err.print(f"{run.path.name}, checkpoint {stored.path.name}", soft_wrap=True)
+    err.print(f"{run.path.name}, {checkpoint_words(stored.path.name)}", soft_wrap=True)
     laps = {}
     for name, protocol in {**car_protocols(config), CAR: config}.items():
         err.print(f"  driving {_NAMES.get(name, f'with the {name} of the car')}")

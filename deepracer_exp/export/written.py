@@ -15,7 +15,7 @@ Written = tuple[Iterable[Path], list[str]]
 
 def checkpoint_line(stored: StoredPolicy) -> str:
     """Return the line that names the exported checkpoint."""
-    return f"checkpoint   {stored.path.name}, iteration {stored.counters['iteration']}"
+    return f"checkpoint   {stored.counters['iteration']}"
 
 
 def reward_text(run: StoredRun) -> str:

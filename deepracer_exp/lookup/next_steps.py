@@ -68,7 +68,7 @@ def outcome(run: RunRecord) -> list[tuple[str, str]]:
             for name, value, form in figures
             if value is not None
         ]
-        facts.append(("Best checkpoint", f"{result.iteration:06d}, by {result.criterion}"))
+        facts.append(("Best checkpoint", f"{result.iteration}, by {result.criterion}"))
         with contextlib.suppress(BadInput):  # a page is written of a run whose metrics are damaged, too
             rows = run.rows or read_metrics(run.path / METRICS)
             crash_free = [row.get("eval_crash_free") for row in rows if row["iteration"] == result.iteration]

@@ -12,7 +12,7 @@ from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.film import Lap, LapRecorder, best_attempt, drive_best_lap
 from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.reports.page import Glimpse
-from deepracer_exp.runs.checkpoint_files import kept_checkpoints
+from deepracer_exp.runs.checkpoint_files import checkpoint_words, kept_checkpoints
 from deepracer_exp.runs.files import CHECKPOINTS, read_config
 
 from .sight import glimpses
@@ -78,7 +78,7 @@ def _shown(lap: Lap, checkpoint: str) -> EvaluatedLap:
     )
     return EvaluatedLap(
         words=words,
-        whose=f"checkpoint {checkpoint}",
+        whose=checkpoint_words(checkpoint),
         course=lap.track,
         x_m=lap.x_m[1:],
         y_m=lap.y_m[1:],

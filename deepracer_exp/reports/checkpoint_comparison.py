@@ -30,7 +30,13 @@ from deepracer_exp.evaluation.result import (
 )
 from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.reports.comparison_page import write_comparison
-from deepracer_exp.runs.checkpoint_files import LINKS, kept_checkpoints, pinned
+from deepracer_exp.runs.checkpoint_files import (
+    LINKS,
+    checkpoint_number,
+    checkpoint_words,
+    kept_checkpoints,
+    pinned,
+)
 from deepracer_exp.runs.checkpoints import check, read_policy
 from deepracer_exp.runs.result import BOTH, CRITERIA, of_conditions
 
@@ -100,7 +106,7 @@ def compare_checkpoints(
     pins = pinned(folder)
     leads_to = {label: (folder / label).resolve() for label in LINKS if (folder / label).is_symlink()}
     for path in reversed(kept_checkpoints(folder)):
-        on_next(path.name)
+        on_next(checkpoint_words(path.name))
         env_steps, figures, fault = None, None, None
         try:
             stored = read_policy(run.experiment, check(path))
@@ -110,7 +116,7 @@ def compare_checkpoints(
         except BadInput as error:
             fault = error.without(path.resolve())
         yield CheckpointResult(
-            name=path.name,
+            name=checkpoint_number(path.name),
             labels=tuple(label for label, target in leads_to.items() if target == path.resolve()),
             pinned=tuple(pins.get(path.name, ())),
             env_steps=env_steps,
@@ -161,10 +167,10 @@ def recommend(results: Sequence[CheckpointResult], metric: Metric) -> tuple[str,
     criterion = of_conditions(CRITERIA[metric], math.isfinite(statistics.held_out_completion))
     why = f"best by {criterion}: {_words(statistics)}"
     if others:
-        why += f"; next is {others[0][0].name}: {_words(others[0][1])}"
+        why += f"; next is checkpoint {others[0][0].name}: {_words(others[0][1])}"
     for marked, of_marked in driven:
         if "best" in marked.labels and marked is not best:
-            why += f"; `best`, chosen in the trials of the training, is {marked.name}: {_words(of_marked)}"
+            why += f"; `best`, chosen in the trials of the training, is checkpoint {marked.name}: {_words(of_marked)}"
     return best.name, why
 
 
@@ -286,10 +292,10 @@ def show_checkpoints(
     out.print("; ".join([*_LEGEND[:2], *held_out, *_LEGEND[2:]]), "", style="dim", soft_wrap=whole)
     for result in results:
         if result.fault is not None:
-            out.print(f"{result.name} is left out: {result.fault}", soft_wrap=whole)
+            out.print(f"checkpoint {result.name} is left out: {result.fault}", soft_wrap=whole)
         if result.pinned:
-            out.print(f"{result.name} is pinned: {', '.join(result.pinned)}", soft_wrap=whole)
-    out.print(f"recommended: {best}: {why}", soft_wrap=whole)
+            out.print(f"checkpoint {result.name} is pinned: {', '.join(result.pinned)}", soft_wrap=whole)
+    out.print(f"recommended: checkpoint {best}: {why}", soft_wrap=whole)
     out.print(f"  use it with checkpoint={best} in evaluate, export and clone")
     if picture is not None:
         rows = [
@@ -304,7 +310,7 @@ def show_checkpoints(
             write_comparison(
                 Path(picture),
                 f"Checkpoints of {run.experiment.name}",
-                [f"Recommended: {best}, {why}.", run.path.name],
+                [f"Recommended: checkpoint {best}, {why}.", run.path.name],
                 [("Evaluated laps", _page_table(results), f"{legend[0].upper()}{legend[1:]}.")],
                 [chart for chart in charts if chart is not None],
             )

@@ -17,6 +17,7 @@ from deepracer_exp.evaluation.race_protocol import Attempt
 from deepracer_exp.evaluation.result import USUAL, Evaluation
 from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.reports.lap_replay import ReplayedLap, is_same_start
+from deepracer_exp.runs.checkpoint_files import checkpoint_words
 from deepracer_exp.runs.checkpoints import StoredPolicy
 
 
@@ -47,13 +48,14 @@ def laps_to_replay(
         if not others:
             laps = count(int(best.complete), "complete lap")
             raise BadInput(
-                f"{run.path.name}, checkpoint {stored.path.name}: {laps} in {count(len(evaluator.trials), 'trial')}; "
-                "accepted: more evaluation.trials, or another run or log beside it to replay against"
+                f"{run.path.name}, {checkpoint_words(stored.path.name)}: {laps} in "
+                f"{count(len(evaluator.trials), 'trial')}; accepted: more evaluation.trials, or another run or log "
+                "beside it to replay against"
             )
         near = [attempt for attempt in others if starts[attempt.trial] == starts[best.trial]]
         chosen.append((_median(near or others), "an ordinary lap"))
     return [
-        _replayed(recorder, attempt, run, f"{words} of checkpoint {stored.path.name}")
+        _replayed(recorder, attempt, run, f"{words} of {checkpoint_words(stored.path.name)}")
         for attempt, words in chosen
     ]
 
@@ -80,7 +82,7 @@ def commands_of_run(run: StoredRun) -> Commands:
             fast_laps_in_words(int(fast.sum()), len(laps), float(times_s.min()), f"on {group.track}")
         )
         steps += [recorder.rows(laps[number])[1] for number in np.flatnonzero(fast)]
-    name = f"{run.path.name}, checkpoint {stored.path.name}"
+    name = f"{run.path.name}, {checkpoint_words(stored.path.name)}"
     if not steps:
         tried = count(len(evaluation.on(USUAL).attempts), "lap")
         raise BadInput(name, f"completes none of {tried} without a reset", "a run that does")

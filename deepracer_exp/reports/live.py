@@ -25,6 +25,7 @@ from deepracer_exp.evaluation.result import USUAL, Evaluation
 from deepracer_exp.lookup.next_steps import outcome, state
 from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.reports.page import Glimpse, Plot, plot_of, render
+from deepracer_exp.runs.checkpoint_files import checkpoint_words
 from deepracer_exp.runs.checkpoints import StoredPolicy, check, read_policy
 from deepracer_exp.runs.files import METRICS, SUMMARY, read_head, read_metrics
 from deepracer_exp.runs.folder import is_held
@@ -111,7 +112,7 @@ class LivePage:
         trained = trained_on(self._run.experiment, self._protocol, evaluation)
         chart = newest_laps(track_lines(evaluator, evaluation, recorder))
         return _Laps(
-            words=f"checkpoint {stored.path.name}, {stored.counters['env_steps']:,} steps",
+            words=f"{checkpoint_words(stored.path.name)}, {stored.counters['env_steps']:,} steps",
             plot=plot_of(chart),
             caption=chart.caption,
             table=results_table(evaluation, self._protocol, trained, Console(quiet=True, width=200)),

@@ -24,6 +24,7 @@ from deepracer_exp.errors import RunFailed, count, writing
 from deepracer_exp.evaluation.evaluator import evaluator_against
 from deepracer_exp.evaluation.film import Lap, drive_best_lap, in_frames, write_film
 from deepracer_exp.lookup.resolve import StoredRun
+from deepracer_exp.runs.checkpoint_files import checkpoint_words
 from deepracer_exp.runs.files import FILMS
 from deepracer_exp.sim.lidar import ANGLES_RAD, MOUNT_X_M
 from deepracer_exp.sim.scenery import box_corners
@@ -295,7 +296,7 @@ def film_run(
     torch.set_num_threads(1)
     evaluator = evaluator_against(rival, run.experiment, replace(protocol, held_out=None))
     err.print(
-        f"{run.path.name}, checkpoint {stored.path.name}: {count(len(evaluator.trials), 'trial')}",
+        f"{run.path.name}, {checkpoint_words(stored.path.name)}: {count(len(evaluator.trials), 'trial')}",
     )
     policy = stored.networks.policy
     lap, acted = drive_best_lap(evaluator, policy)

@@ -74,6 +74,16 @@ def restore_links(folder: Path) -> None:
             path.symlink_to(name, target_is_directory=True)
 
 
+def checkpoint_words(name: str) -> str:
+    """Return what people call the checkpoint in a folder of this name: ``checkpoint 8`` for ``000008``."""
+    return f"checkpoint {checkpoint_number(name)}"
+
+
+def checkpoint_number(name: str) -> str:
+    """Return what `checkpoint=` takes for the folder of this name: ``8`` for ``000008``, ``best`` for ``best``."""
+    return str(int(name)) if name.isdecimal() else name
+
+
 def find_checkpoint(folder: Path, name: str) -> Path:
     """Return the folder of a checkpoint, or the link to it; it may be a missing `last` if there are other checkpoints.
 
@@ -91,7 +101,10 @@ def find_checkpoint(folder: Path, name: str) -> Path:
     kept = kept_checkpoints(folder)
     if not (path.exists() or path.is_symlink() or (name == "last" and kept)):
         accepted = ", ".join(
-            [*(link for link in LINKS if (folder / link).is_symlink()), *(p.name for p in kept)]
+            [
+                *(link for link in LINKS if (folder / link).is_symlink()),
+                *(checkpoint_number(p.name) for p in kept),
+            ]
         )
         raise BadInput(f"checkpoint={name}", f"{path} is not there; checkpoints: {accepted or 'none'}")
     if path.exists() and path.resolve().parent != folder.resolve():

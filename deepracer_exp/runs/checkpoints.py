@@ -19,7 +19,14 @@ from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.errors import BadInput, RunFailed
 
-from .checkpoint_files import find_checkpoint, kept_checkpoints, pinned, restore_links, write_hashes
+from .checkpoint_files import (
+    checkpoint_words,
+    find_checkpoint,
+    kept_checkpoints,
+    pinned,
+    restore_links,
+    write_hashes,
+)
 from .components import State, check_folder, load_component, one_line
 from .files import CHECKPOINTS, REPLAY
 
@@ -76,7 +83,9 @@ def intact_checkpoint(folder: Path, name: str, *, resumable: bool = False) -> Pa
             continue
         if reasons:
             why = "; ".join(reasons)
-            logger.warning("checkpoint=%s: %s; using %s, the newest intact one", name, why, fault.name)
+            logger.warning(
+                "checkpoint=%s: %s; using %s, the newest intact one", name, why, checkpoint_words(fault.name)
+            )
         return fault
     raise BadInput(f"checkpoint={name}", f"{'; '.join(reasons[:3])}; no checkpoint in {folder} is intact")
 

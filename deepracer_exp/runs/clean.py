@@ -10,7 +10,7 @@ from pathlib import Path
 
 from deepracer_exp.errors import BadInput, RunFailed
 
-from .checkpoint_files import LINKS, kept_checkpoints, pinned, verify
+from .checkpoint_files import LINKS, checkpoint_words, kept_checkpoints, pinned, verify
 from .files import (
     CHECKPOINTS,
     CONFIG,
@@ -141,7 +141,7 @@ def _search(
         if not pins:
             removables.removable.append(Removable(run, DELETED, (run,), _size(run)))
             return
-        reasons = ", ".join(f"{name} {why}" for name, why in sorted(pins.items()))
+        reasons = ", ".join(f"{checkpoint_words(name)} {why}" for name, why in sorted(pins.items()))
         removables.kept.append((run, f"deleted in MLflow, but needed: {reasons}"))
     spare = _spare_checkpoints(run, set(pins))
     is_known = run_id is None or (overview is not None and run_id in overview.deleted)
@@ -208,7 +208,7 @@ def deletable(run: Path, runs_dir: Path) -> Removable:
     wanted = _cloned_from(runs_dir)[full_name(place)] | {
         name: ", ".join(reasons) for name, reasons in pinned(run / CHECKPOINTS).items()
     }
-    reasons = [f"checkpoint {name} is {why}" for name, why in sorted(wanted.items())]
+    reasons = [f"{checkpoint_words(name)} is {why}" for name, why in sorted(wanted.items())]
     if reason := _in_progress(run) or ", ".join(reasons):
         raise BadInput(run, f"{reason}; nothing was deleted")
     return Removable(run, ASKED, (run,), _size(run))

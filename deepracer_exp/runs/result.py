@@ -115,14 +115,20 @@ class RunResult:
         return of_conditions(CRITERIA.get(self.measure, self.measure), self.held_out_completion is not None)
 
     def words(self) -> str:
-        """Return the known figures: ``mean usual lap 7.97 s, usual completion 100.0%``."""
+        """Return the known figures: ``mean usual lap 7.97 s, usual laps complete 100%``."""
         if not self.evaluated:
             figures = [
-                ("exploring completion, %", self.completion, "{:.1f}"),
+                ("exploring completion, %", self.completion, "{:.0f}"),
                 ("fastest exploring lap, s", self.lap_time_s, "{:.2f}"),
             ]
         else:
-            figures = [(self.figure(name), getattr(self, key), form) for name, key, form, _ in FIGURES]
+            # Where all laps are complete, so is each of them.
+            all_complete = self.laps_percent == 100
+            figures = [
+                (self.figure(name), getattr(self, key), "{:.0f}" if name.endswith("%") else form)
+                for name, key, form, _ in FIGURES
+                if not (all_complete and key == "completion")
+            ]
         parts = [
             (*name.split(", "), form.format(value)) for name, value, form in figures if value is not None
         ]
@@ -177,14 +183,14 @@ def why_not_fastest(result: RunResult, rows: Iterable[Mapping[str, Any]]) -> str
     lap = fastest_reliable(by_iteration.values())
     if lap is None or result.iteration in (None, lap.iteration):
         return None
-    best, fast = f"{result.iteration:06d}", f"{lap.iteration:06d}"
+    fast = f"checkpoint {lap.iteration}"
     score_s = by_iteration[lap.iteration].get("eval_race_score_s")
     if result.measure != "race_score" or result.race_score_s is None:
-        return f"{best} ranks above {fast}, which laps faster, by {result.criterion}"
-    score, best_s = result.figure(BOTH), f"{result.race_score_s:.2f} s"
+        return f"checkpoint {result.iteration} ranks above {fast}, which laps faster, by {result.criterion}"
+    score = result.figure(BOTH)
     if score_s is None:
-        return f"{fast} laps faster, but it has no {score}, that of {best} is {best_s}"
-    return f"{fast} laps faster, but its {score} is {score_s:.2f} s, that of {best} {best_s}"
+        return f"{fast} laps faster, but it has no {score}"
+    return f"{fast} laps faster, but its {score} is {score_s:.2f} s"
 
 
 def reliable_lap_s(row: Mapping[str, Any]) -> float | None:

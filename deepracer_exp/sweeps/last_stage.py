@@ -18,6 +18,7 @@ from optuna.trial import FrozenTrial
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL
 from deepracer_exp.lookup.resolve import StoredRun
+from deepracer_exp.runs.checkpoint_files import checkpoint_words
 from deepracer_exp.runs.files import is_run
 from deepracer_exp.runs.result import FAILED, INTERRUPTED
 from deepracer_exp.tracking.metadata import STUDY
@@ -110,7 +111,7 @@ class LastStage:
         plan = self._planned(parent, of)
         if isinstance(plan, Path):
             return plan
-        self._view.say(f"{name}, checkpoint {checkpoint}, with {clone_words(self._config.config)}")
+        self._view.say(f"{name}, {checkpoint_words(checkpoint)}, with {clone_words(self._config.config)}")
 
         def show(steps: int) -> None:  # without a check: the training hears of a Ctrl-C by itself
             self._view.show(self._claims(), f"{name}: {steps:,} steps")

@@ -10,7 +10,7 @@ from deepracer_exp.config.overrides import group_of, key_of
 from deepracer_exp.config.parse import import_own_classes, parse_experiment
 from deepracer_exp.config.stored import with_overrides
 from deepracer_exp.lookup.resolve import StoredRun
-from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pin
+from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, checkpoint_words, pin
 from deepracer_exp.runs.files import (
     CHECKPOINTS,
     PROVENANCE,
@@ -87,7 +87,7 @@ def describe_clone(parent: StoredRun, clone: Experiment, lineage: Lineage) -> li
     """Describe a clone's origin, and warn of each group that differs from its parent's, a line each."""
     before: dict[str, Any] = vars(parent.experiment)
     notes = [
-        f"clone of {parent.path.name}, checkpoint {lineage.checkpoint}; learning rate {clone.algorithm.lr:g} "
+        f"clone of {parent.path.name}, {checkpoint_words(lineage.checkpoint)}; learning rate {clone.algorithm.lr:g} "
         f"(the parent's: {parent.experiment.algorithm.lr:g})"
     ]
     for group, why in _ALLOWED.items():

@@ -68,7 +68,7 @@ def test_figures_of_the_best_checkpoint_are_those_of_the_summary(record):
     evaluated = dataclasses.replace(record("a"), summary={"best": best, "reason": "done"})
     table = {name: texts for name, texts, _ in results([evaluated, record("b")])}
     assert {name: texts[0] for name, texts in table.items() if texts[1] == NOTHING} == {
-        "best checkpoint": "000010",
+        "best checkpoint": "10",
         "race score (usual and held-out), s": "8.50",
         "usual laps complete, %": "88",
         "usual completion, %": "96.2",

@@ -488,11 +488,11 @@ def test_a_run_of_ours_is_judged_by_its_own_rules_and_its_decision_is_what_the_r
 def test_a_run_of_ours_is_advised_to_take_a_checkpoint_that_it_has() -> None:
     fell_back = [*LEARNED, 0.4, 0.4, 0.4]
     for completions, words in (
-        (LEARNED, "checkpoint 000010, the best, whose evaluation completed 90%"),
-        (fell_back, "take checkpoint 000010 (the best by race score (usual))"),
+        (LEARNED, "checkpoint 10, the best, whose evaluation completed 90%"),
+        (fell_back, "take checkpoint 10 (the best by race score (usual))"),
     ):
         view = training(completions, evaluated=FALLING)
-        assert "000010" not in findings(view)[0].sentence
+        assert "checkpoint 10" not in findings(view)[0].sentence
         own = replace(view, run=run_of(view))
         assert words in findings(own)[0].sentence
         assert "enough laps" not in "".join(one.caption for one in charts_of(own))
@@ -516,10 +516,7 @@ def test_a_car_that_became_faster_and_less_sure_is_called_so_with_what_to_do() -
     assert "faster meanwhile, from 7.80 to 6.00 s: it is faster and less sure" in first.sentence
     assert "Clone it with randomization=sim2real, at a tenth of the learning rate" in first.sentence
     # The best, of iteration 10, is as unsure as the last one.
-    assert (
-        "or take checkpoint 000005, an earlier one, whose held-out evaluation completed 100%"
-        in first.sentence
-    )
+    assert "or take checkpoint 5, an earlier one, whose held-out evaluation completed 100%" in first.sentence
     trained_so = held_out(training([1.0] * 12), completions, [8.0] * 12, randomized=True)
     assert "Clone it at a tenth of the learning rate" in findings(trained_so)[0].sentence
 
@@ -529,10 +526,10 @@ def test_a_car_that_became_faster_and_less_sure_is_called_so_with_what_to_do() -
     [
         ("reliable", {"lap_share": 0.9}, "Train longer"),
         ("overfitting", {"held_out_completion_before": 86.0, "held_out_completion_since": 67.0}, "sim2real"),
-        ("laps_slower", {"lap_time_s_before": 6.0, "lap_time_s_since": 6.6}, "Take checkpoint 000010"),
+        ("laps_slower", {"lap_time_s_before": 6.0, "lap_time_s_since": 6.6}, "Take checkpoint 10"),
         ("collapsed", {"completion": 20.0}, "Raise the entropy coefficient (algorithm.entropy_coeff)"),
         ("not_learning", {"completion": 20.0}, "training longer will not help"),
-        ("converged", {}, "Race with checkpoint 000010"),
+        ("converged", {}, "Race with checkpoint 10"),
     ],
 )
 def test_what_ended_a_run_decides_what_to_do_next(rule: str, values: dict[str, float], to_do: str) -> None:
@@ -567,7 +564,7 @@ def test_an_entropy_that_rises_is_named_with_its_cure_in_the_words_of_whoever_tr
     assert first.rule == "entropy_rises"
     assert "with a lower entropy (now 0.01) or learning rate (now 0.0003)." in first.sentence
     own = findings(replace(view, run=run_of(view)))[0]
-    assert "Clone checkpoint 000010 (the best by " in own.sentence
+    assert "Clone checkpoint 10 (the best by " in own.sentence
     assert "with a lower algorithm.entropy_coeff (now 0.01) or algorithm.lr (now 0.0003)." in own.sentence
     sac = prepare(replace(view.recording, hyperparameters={"sac_alpha": 0.2}))
     for other in (sac, training([1.0] * 30, entropy=rising), training(fading, entropy=rising[::-1])):

@@ -177,7 +177,7 @@ def own(times_s: list[float], recording: Recording | None = None, **more: object
 def test_a_run_of_ours_names_the_checkpoint_to_take_instead() -> None:
     said = sentence(own(SLOWED_S))
     assert said.startswith("The evaluated laps became slower from iteration 1 on, from 5.68 to 6.57 s")
-    assert said.endswith("Take checkpoint 000000 (the best by race score (usual and held-out)).")
+    assert said.endswith("Take checkpoint 0 (the best by race score (usual and held-out)).")
 
 
 def test_laps_of_several_tracks_are_not_mixed() -> None:

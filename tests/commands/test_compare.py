@@ -98,7 +98,7 @@ def test_single_runs_stand_side_by_side(call, tmp_path):
     # Alike but for their seed, they are one group.
     made_up_run(tmp_path / "runs" / "e" / "third", ["seed=3", "algorithm.lr=1e-3"], 9.0)
     said = lines(call("compare", "second", "third").stdout)
-    assert "best checkpoint 000010 000010" in said
+    assert "best checkpoint 10 10" in said
     assert any(line.startswith("default 2") for line in said)
 
 

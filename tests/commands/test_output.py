@@ -87,10 +87,8 @@ def test_the_last_lines_of_a_training_name_the_fastest_reliable_lap(tmp_path, ca
     shown = capsys.readouterr().out.splitlines()
     assert f"  fastest reliable lap: {words}" in shown
     assert any("exploring: 12 episodes, 3 laps, the fastest in 6.10 s" in line for line in shown)
-    (chosen,) = (line for line in shown if "best checkpoint in" in line)
-    assert chosen.startswith(
-        "  best checkpoint in the training's evaluations by race score (usual): 000040, mean usual lap 6.72 s"
-    )
+    assert "  best by race score (usual): checkpoint 40" in shown
+    assert "    mean usual lap 6.72 s, usual completion 100%, race score (usual) 8.00 s" in shown
 
 
 @pytest.mark.parametrize("store", ["http://127.0.0.1:9", None])

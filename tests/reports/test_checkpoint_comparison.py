@@ -58,18 +58,19 @@ def result(name: str, found: LapStatistics | None, **changes: object) -> Checkpo
     ("found", "name", "words"),
     [
         (
-            {"000010": figures(95, 9.0), "000020": figures(50, 8.5)},
-            "000020",
+            {"10": figures(95, 9.0), "20": figures(50, 8.5)},
+            "20",
             "best by race score (usual): race score (usual) 8.50 s, usual completion 90.0%, median usual "
-            "lap 8.50 s; next is 000010: race score (usual) 9.00 s, usual completion 90.0%, median usual lap 9.00 s",
+            "lap 8.50 s; next is checkpoint 10: "
+            "race score (usual) 9.00 s, usual completion 90.0%, median usual lap 9.00 s",
         ),
-        ({"000010": figures(100, 8.5), "000020": figures(90, 8.5)}, "000010", "next is 000020"),
+        ({"10": figures(100, 8.5), "20": figures(90, 8.5)}, "10", "next is checkpoint 20"),
         (
-            {"000010": figures(0, math.nan, done=62.0), "000020": figures(0, math.nan, done=41.0)},
-            "000010",
+            {"10": figures(0, math.nan, done=62.0), "20": figures(0, math.nan, done=41.0)},
+            "10",
             "no complete lap, usual completion 62.0%",
         ),
-        ({"000010": figures(50, 9.0), "000020": None}, "000010", "race score (usual) 9.00 s"),
+        ({"10": figures(50, 9.0), "20": None}, "10", "race score (usual) 9.00 s"),
     ],
     ids=["best by the run's metric", "a tie goes to the oldest", "no lap", "never a corrupt one"],
 )
@@ -80,10 +81,10 @@ def test_a_checkpoint_is_recommended_with_the_next_one(found, name, words):
 
 
 def test_a_recommendation_other_than_best_says_so_and_without_any_there_is_none():
-    listed = [result("000010", figures(100, 9.0), labels=("best",)), result("000020", figures(100, 8.5))]
-    other = "`best`, chosen in the trials of the training, is 000010: race score (usual) 9.00 s"
+    listed = [result("10", figures(100, 9.0), labels=("best",)), result("20", figures(100, 8.5))]
+    other = "`best`, chosen in the trials of the training, is checkpoint 10: race score (usual) 9.00 s"
     assert other in recommend(listed, "race_score")[1]
-    assert recommend([result("000010", None)], "race_score") is None
+    assert recommend([result("10", None)], "race_score") is None
 
 
 def test_figures_are_those_of_the_usual_conditions_with_the_held_out_ones_beside_them():
@@ -109,9 +110,9 @@ def test_a_track_without_a_lap_leaves_no_time_of_several_tracks():
 
 
 LISTED = (
-    result("000100", figures(95, 8.13, 15), pinned=("promoted as racer@champion",)),
-    result("000110", None, labels=("best",)),
-    result("001120", figures(40, 10.4, 45), labels=("last",)),
+    result("100", figures(95, 8.13, 15), pinned=("promoted as racer@champion",)),
+    result("110", None, labels=("best",)),
+    result("1120", figures(40, 10.4, 45), labels=("last",)),
 )
 
 
@@ -120,7 +121,7 @@ LISTED = (
 )
 def test_a_narrow_table_drops_columns_but_truncates_no_number(width, median, intervals):
     console = Console(width=width, file=io.StringIO())
-    console.print(comparison_table(LISTED, "000100", console))
+    console.print(comparison_table(LISTED, "100", console))
     text = console.file.getvalue()
     assert all(len(line) <= width for line in text.splitlines())
     assert "best, bad" in text
@@ -132,7 +133,7 @@ def test_a_narrow_table_drops_columns_but_truncates_no_number(width, median, int
 
 def test_held_out_conditions_are_a_column_only_where_they_were_driven():
     console = Console(width=160, file=io.StringIO())
-    console.print(comparison_table([result("000010", figures(95, 8.0))], "", console))
+    console.print(comparison_table([result("10", figures(95, 8.0))], "", console))
     assert "held-out" not in console.file.getvalue()
 
 
@@ -147,9 +148,9 @@ def row(
 @pytest.mark.parametrize(
     "rows",
     [
-        [row("000010", 8.1, 95.0, (9.0, 40.0)), row("000020", 8.1, 95.0)],
-        [row("000010", math.nan, 0.0), row("000020", 8.1, 100.0)],
-        [row("000010", math.nan, 0.0)],
+        [row("10", 8.1, 95.0, (9.0, 40.0)), row("20", 8.1, 95.0)],
+        [row("10", math.nan, 0.0), row("20", 8.1, 100.0)],
+        [row("10", math.nan, 0.0)],
     ],
     ids=["on each other", "one without a lap", "no lap"],
 )
@@ -158,7 +159,7 @@ def test_every_checkpoint_is_in_the_legend_of_the_chart(rows):
     assert drawn(chart).data
     panel = chart.rows[0][0]
     named = [layer["name"] for layer in panel.layers if layer.get("showlegend")]
-    assert all(any(name.startswith(str(one["name"])) for name in named) for one in rows)
-    assert f"recommended: {rows[-1]['name']}" in named
+    assert all(any(name.startswith(f"checkpoint {one['name']}") for name in named) for one in rows)
+    assert f"recommended: checkpoint {rows[-1]['name']}" in named
     if any(one["complete"] for one in rows):
         assert panel.x_range[0] > panel.x_range[1], "faster is to the right"

@@ -42,29 +42,33 @@ def test_every_kept_checkpoint_drives_the_same_trials(run_dir, call, tmp_path):
     pin(run_dir / "checkpoints", "000008", "promoted as racer@champion")
     ended = call("checkpoints", run_dir.name, *QUICK, "-o", "picture.html")
     assert ended.code == 0, ended.stderr
-    assert re.search(r"000007 .*best", ended.stdout)
-    assert re.search(r"000008 .*pinned", ended.stdout)
-    assert re.search(r"000009 .*last", ended.stdout)
-    assert "000008 is pinned: promoted as racer@champion" in ended.stdout
+    assert re.search(r"(?m)^7 .*best", ended.stdout)
+    assert re.search(r"(?m)^8 .*pinned", ended.stdout)
+    assert re.search(r"(?m)^9 .*last", ended.stdout)
+    assert "checkpoint 8 is pinned: promoted as racer@champion" in ended.stdout
     page = Html((tmp_path / "picture.html").read_text())
-    assert "Checkpoints of tiny Recommended: 000007, best by race score (usual and held-out)" in page.text
+    assert (
+        "Checkpoints of tiny Recommended: checkpoint 7, best by race score (usual and held-out)" in page.text
+    )
     assert "checkpoint kept as steps laps %" in page.text
     assert "figure-speed_and_stability" in page.ids
     # Whatever one driver leaves to the next would show.
     rows = {
-        line.split()[0]: line.split()[-6:] for line in ended.stdout.splitlines() if line.startswith("0000")
+        line.split()[0]: line.split()[-6:]
+        for line in ended.stdout.splitlines()
+        if line[:1] in "789" and line[1:2] == " "
     }
-    assert rows["000007"] == rows["000009"] != rows["000008"]
-    assert "recommended: 000007: best by race score (usual and held-out)" in ended.stdout
+    assert rows["7"] == rows["9"] != rows["8"]
+    assert "recommended: checkpoint 7: best by race score (usual and held-out)" in ended.stdout
 
 
 def test_a_corrupt_checkpoint_is_shown_and_left_out(run_dir, call):
     corrupt(run_dir, "000009")
     ended = call("checkpoints", str(run_dir), *QUICK, "evaluation.held_out=null")
     assert ended.code == 0, ended.stderr
-    assert re.search(r"000009 .*last, bad", ended.stdout)
-    assert re.search(r"000009 is left out: .*state.tdz is not as it was written", ended.stdout)
-    assert "recommended: 000009" not in ended.stdout
+    assert re.search(r"(?m)^9 .*last, bad", ended.stdout)
+    assert re.search(r"checkpoint 9 is left out: .*state.tdz is not as it was written", ended.stdout)
+    assert "recommended: checkpoint 9" not in ended.stdout
 
 
 def test_a_run_with_only_corrupt_checkpoints_is_refused(run_dir, call):
@@ -88,8 +92,8 @@ def test_evaluate_warns_when_it_uses_another_checkpoint(run_dir, call):
     assert ended.code == 0, ended.stderr
     (warning,) = [line for line in ended.stderr.splitlines() if line.startswith("warning: ")]
     assert "000007: " in warning
-    assert "using 000009, the newest intact one" in warning
-    assert "checkpoint 000009" in ended.stderr
+    assert "using checkpoint 9, the newest intact one" in warning
+    assert "checkpoint 9:" in ended.stderr
     (file,) = (run_dir / "evaluations").iterdir()
     assert json.loads(file.read_text())["checkpoint"]["name"] == "000009"
 

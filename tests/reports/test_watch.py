@@ -245,7 +245,7 @@ def test_the_live_page_changes_when_there_is_a_newer_checkpoint(run_dir, protoco
     second = page.shown
     assert page.update() is False, "drawn again for nothing"
     newest = (run.checkpoints / "last").resolve()
-    assert f"checkpoint {newest.name}" in second[1]
+    assert f"checkpoint {int(newest.name)}" in second[1]
     before = {path.relative_to(run.path) for path in run.path.rglob("*")}
     newer = run.checkpoints / "999999"
     shutil.copytree(newest, newer)

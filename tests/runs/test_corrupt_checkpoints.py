@@ -174,7 +174,7 @@ def test_a_missing_last_is_the_newest_but_a_missing_best_is_refused(folder):
     (folder / "last").unlink()
     (folder / "best").unlink()
     assert intact_checkpoint(folder, "last").name == "000040"
-    assert "000040, 000030" in refusal(folder, "best")
+    assert "40, 30" in refusal(folder, "best")
     shutil.rmtree(folder)
     assert "checkpoints: none" in refusal(folder, "last")
 

@@ -63,16 +63,20 @@ BEST |= {"eval_completion": 100.0, "eval_lap_time_s": 7.97, "eval_lap_share": 1.
     [
         (
             {"best": BEST | {"held_out_completion": 84.7}},
-            "mean usual lap 7.97 s, usual laps complete 100%, usual completion 100.0%, held-out completion 84.7%, "
+            "mean usual lap 7.97 s, usual laps complete 100%, held-out completion 85%, "
             "race score (usual and held-out) 8.02 s",
         ),
         (
             {"best": BEST},
-            "mean usual lap 7.97 s, usual laps complete 100%, usual completion 100.0%, race score (usual) 8.02 s",
+            "mean usual lap 7.97 s, usual laps complete 100%, race score (usual) 8.02 s",
+        ),
+        (
+            {"best": BEST | {"eval_lap_share": 0.875, "eval_completion": 96.25}},
+            "mean usual lap 7.97 s, usual laps complete 88%, usual completion 96%, race score (usual) 8.02 s",
         ),
         (
             {"lap_share": 0.5, "best_lap_time_s": 12.0, "last": {"completion": 61.0}},
-            "exploring completion 61.0%, fastest exploring lap 12.00 s",
+            "exploring completion 61%, fastest exploring lap 12.00 s",
         ),
     ],
 )
@@ -93,11 +97,11 @@ def test_why_another_checkpoint_than_the_fastest_is_the_best_is_said():
     best = evaluated(40, 5.37, 5.6)
     assert why([evaluated(30, 5.4, 5.7), best]) is None
     assert why([evaluated(30, 5.23, 6.02), best]) == (
-        "000030 laps faster, but its race score (usual and held-out) is 6.02 s, that of 000040 5.60 s"
+        "checkpoint 30 laps faster, but its race score (usual and held-out) is 6.02 s"
     )
     assert why([evaluated(30, 5.23, None), best]) == (
-        "000030 laps faster, but it has no race score (usual and held-out), that of 000040 is 5.60 s"
+        "checkpoint 30 laps faster, but it has no race score (usual and held-out)"
     )
     assert why([evaluated(30, 5.23, 6.02), best], "progress") == (
-        "000040 ranks above 000030, which laps faster, by completion (usual and held-out)"
+        "checkpoint 40 ranks above checkpoint 30, which laps faster, by completion (usual and held-out)"
     )

@@ -83,7 +83,7 @@ def test_the_page_says_what_to_submit_why_and_how(tmp_path):
     page = Html(study_page(study))
     assert "What to submit, and why" in page.text
     text = " ".join(page.text.split())
-    assert "Submit run run-1-clone1 , checkpoint 000040, which best:lr_entropy means from now on" in text
+    assert "Submit run run-1-clone1 , checkpoint 40, which best:lr_entropy means from now on" in text
     assert "deepracer-exp export best:lr_entropy format=aws" in page.text
     assert (
         "seconds per complete lap of both conditions together, failed laps included, on 60 laps" in page.text

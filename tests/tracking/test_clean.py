@@ -125,8 +125,8 @@ def test_a_deleted_run_that_is_needed_is_kept_with_a_reason(season, client):
         client.delete_run(run_id)
     assert DELETED not in [what for _, what, _ in listed(season, asked=True)]
     reasons = kept(season, asked=True)
-    assert reasons["1"] == "deleted in MLflow, but needed: 000020 cloned to season/3"
-    assert reasons["2"] == "deleted in MLflow, but needed: 000020 registered as season"
+    assert reasons["1"] == "deleted in MLflow, but needed: checkpoint 20 cloned to season/3"
+    assert reasons["2"] == "deleted in MLflow, but needed: checkpoint 20 registered as season"
 
 
 def test_a_run_that_a_training_holds_stays_until_it_is_released(season):
@@ -191,7 +191,7 @@ def test_apply_removes_what_was_listed_and_nothing_else(season, call):
     assert shown.code == 0, shown.stderr
     words = " ".join(shown.stdout.split())
     assert "--apply removes it" in words
-    assert f"{size} bytes checkpoints neither best nor last: 000010" in words
+    assert f"{size} bytes checkpoints neither best nor last: 10" in words
     assert "1.0 kB trace of a failed run season/2" in words
     assert f"{(2 * size + 1000) / 1000:.1f} kB in all" in words
     assert tree(season.runs_dir) == before

@@ -92,16 +92,13 @@ def test_wherever_a_run_ends_its_last_policy_is_evaluated_and_all_name_the_same_
     assert last["iteration"] % 50 != 0
     assert best["iteration"] == last["iteration"]
     assert best["eval_completion"] == last["eval_completion"] is not None
-    name = f"{best['iteration']:06d}"
-    assert str((ended.folder / "checkpoints" / "best").readlink()) == name
-    assert (
-        f"best checkpoint in the training's evaluations by race score (usual and held-out): {name}, "
-        in ended.stdout
-    )
-    assert f"completion {best['eval_completion']:.1f}%" in ended.stdout
+    assert str((ended.folder / "checkpoints" / "best").readlink()) == f"{best['iteration']:06d}"
+    name = f"checkpoint {best['iteration']}"
+    assert f"  best by race score (usual and held-out): {name}\n" in ended.stdout
+    assert f"completion {best['eval_completion']:.0f}%" in ended.stdout
     found = findings(prepare(read_run_recording(ended.folder)))
     (submit,) = [one.sentence for one in found if one.rule == "submit"]
-    assert submit.startswith(f"Race with checkpoint {name}, the best by race score (usual and held-out): ")
+    assert submit.startswith(f"Race with {name}, the best by race score (usual and held-out): ")
     compared = call("checkpoints", ended.folder.name)
     assert compared.code == 0, compared.stderr
     assert f"recommended: {name}: " in compared.stdout

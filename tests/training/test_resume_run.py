@@ -160,7 +160,7 @@ def test_after_a_corrupt_checkpoint_the_run_is_written_again_from_the_newest_int
     ended = call("resume", run.name, "budget.iterations=6")
     assert ended.code == 0, ended.stderr
     assert "000003: corrupt" in ended.stderr
-    assert "using 000002, the newest intact one" in ended.stderr
+    assert "using checkpoint 2, the newest intact one" in ended.stderr
     assert_same_run(run, whole(trained))
 
 

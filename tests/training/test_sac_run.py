@@ -79,7 +79,7 @@ def test_after_a_corrupt_checkpoint_a_run_with_a_replay_is_written_again(trained
     (run / "summary.json").unlink()
     ended = call("resume", run.name, "budget.iterations=6")
     assert ended.code == 0, ended.stderr
-    assert "using 000002, the newest intact one" in ended.stderr
+    assert "using checkpoint 2, the newest intact one" in ended.stderr
     assert_same_run(run, trained(*SAC, *budget(6)).folder)
 
 

@@ -274,13 +274,16 @@ def speed_and_stability(checkpoints: pd.DataFrame, recommended: str) -> Chart:
             layers.append(points([away], [share], color, size=9, symbol="circle-open"))
         layers.append(line([x, x, x], [checkpoint.low, checkpoint.complete, checkpoint.high], color))
         if checkpoint.name == recommended:
-            ring = f"recommended: {recommended}"
+            ring = f"recommended: checkpoint {recommended}"
             layers.append(points([x], [checkpoint.complete], INK, ring, size=20, symbol="circle-open"))
         # Lap times are multiples of the control period, so that points coincide: the older ones are larger.
         later = checkpoints.iloc[number + 1 :]
         above = ((later["lap_time_s"] == x) & (later["complete"] == checkpoint.complete)).sum()
         words = "  ".join(
-            filter(None, [checkpoint.name, checkpoint.labels, "" if np.isfinite(x) else "no lap"])
+            filter(
+                None,
+                [f"checkpoint {checkpoint.name}", checkpoint.labels, "" if np.isfinite(x) else "no lap"],
+            )
         )
         layers.append(points([x], [checkpoint.complete], color, words, size=8 + 5 * above))
     times_s = checkpoints[["lap_time_s", "held_out_lap_time_s"]].to_numpy(np.float64)
