@@ -120,7 +120,7 @@ def test_the_newest_intact_checkpoint_replaces_a_corrupt_one_that_was_not_given_
         (message,) = [record.message for record in caplog.records if record.name == "deepracer_exp"]
         assert f"checkpoint={name}" in message
         assert corrupt in message or f"/{name}:" in message
-        assert f"{newest}, the newest intact one" in message
+        assert f"using checkpoint {int(newest)}, the newest intact one" in message
         assert "\n" not in message
     refusal(folder, "20")
     assert intact_checkpoint(folder, "10").name == "000010"
