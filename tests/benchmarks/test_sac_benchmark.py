@@ -46,4 +46,4 @@ def test_the_peer_trains_for_its_seconds_and_drives_laps(algorithm: str) -> None
     assert found["train_s"] >= 1.0
     assert found["reliable_s"] is None
     assert 0 <= found["lap_share"] <= 1
-    assert 0 < found["held_out_completion"] < 100
+    assert 0 < found["held_out_completion"] <= 100

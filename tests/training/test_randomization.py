@@ -57,7 +57,7 @@ def test_the_pages_table_says_what_the_options_do(option):
 
 
 def test_the_pages_table_says_what_pictures_differ_in():
-    header, rows = table(1)
+    header, rows = table(2)
     content = yaml.safe_load((ROOT / "conf" / "randomization" / "sim2real.yaml").read_text(encoding="utf-8"))
     expected = {name: f"{low:g} to {high:g}" for name, (low, high) in content["pictures"].items()}
     assert {row[0]: row[header.index("sim2real")] for row in rows} == expected

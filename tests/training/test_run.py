@@ -61,7 +61,7 @@ def test_a_finished_run_says_so_and_names_its_folder(trained):
     assert ended.summary["reason"] == "budget reached: env_steps"
     assert ended.stdout.startswith("\nfinished: budget reached: env_steps\n")
     assert str(ended.folder.relative_to(ended.cwd)) in ended.stdout
-    assert "100% · iteration 4 · 4,096 steps" in ended.stderr
+    assert "\niteration 4  4,096 steps  " in ended.stderr
     assert "\x1b" not in ended.stderr + ended.stdout
 
 
@@ -149,7 +149,6 @@ def test_several_tracks_train_together_and_each_has_its_metrics(trained):
     assert ended.folder.name.split("-", 2)[2] == label
     with_laps = ends[ends.episode_status == "lap_complete"].track.nunique()
     assert f"laps on {with_laps} of 3 tracks" in ended.stdout
-    assert " · least " in ended.stderr
 
 
 @pytest.mark.parametrize(
