@@ -33,7 +33,7 @@ class Driven:
     lap_time_s: float | None
     """Mean of the complete laps, None without one."""
     held_out_completion: float
-    """The same on held-out conditions: other friction, noise and the like."""
+    """Completion on held-out conditions (other friction, noise, delays), per cent of the lap, mean."""
     held_out_lap_time_s: float | None
 
     def figures(self) -> dict[str, float | None]:

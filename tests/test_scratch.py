@@ -41,7 +41,7 @@ def test_a_folder_that_is_made_aside_is_whole_while_it_is_in_use_and_gone_after(
 
 @pytest.fixture
 def semaphores():
-    """Make files named as semaphores in shared memory, opened by nobody, and remove what is left of them."""
+    """Make files named as semaphores that no process has open, and remove the remaining ones."""
     made = []
 
     def make(name: str) -> Path:
