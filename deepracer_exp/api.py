@@ -21,6 +21,7 @@ from deepracer_exp.evaluation.evaluate import evaluate_run
 from deepracer_exp.evaluation.plan import plan_evaluation
 from deepracer_exp.evaluation.result import Evaluation
 from deepracer_exp.lookup.resolve import resolve
+from deepracer_exp.reports.run_page import RunReport
 from deepracer_exp.runs.files import METRICS, SUMMARY, read_config, read_metrics, read_object
 from deepracer_exp.runs.recording import read_run_recording
 from deepracer_exp.training.plan import plan_resume, plan_training
@@ -85,7 +86,8 @@ def train(
     Raises:
         BadInput: before anything was started; no folder is left.
     """
-    return run_training(plan_training(experiment.config, experiment.composition), console, callbacks)
+    plan = plan_training(experiment.config, experiment.composition)
+    return run_training(plan, console, callbacks, RunReport())
 
 
 def resume(
@@ -108,7 +110,7 @@ def resume(
         BadInput: it has ended, is being trained, or was started with other values.
     """
     plan = plan_resume(resolve(str(run), Path(runs_dir), None).path, overrides)
-    return run_training(plan, console, callbacks)
+    return run_training(plan, console, callbacks, RunReport())
 
 
 def evaluate(run: str | Path, *overrides: str) -> Evaluation:

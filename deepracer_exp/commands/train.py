@@ -134,6 +134,7 @@ def _train(args: argparse.Namespace) -> int:
     print_start()
     start_workers_early(any(plan.experiment.collector.forks for plan in plans))
 
+    from deepracer_exp.reports.run_page import RunReport
     from deepracer_exp.tracking.projector import Projector
     from deepracer_exp.training.run import run_training, try_out
 
@@ -143,7 +144,7 @@ def _train(args: argparse.Namespace) -> int:
     outcomes = []
     with Projector() as projector:
         for plan in plans:
-            outcome = run_training(plan, plain_console(stderr=True), projector=projector)
+            outcome = run_training(plan, plain_console(stderr=True), report=RunReport(), projector=projector)
             outcomes.append(outcome)
             if plan.experiment.debug and outcome.error is not None:
                 traceback.print_exception(outcome.error)
@@ -186,10 +187,11 @@ def _continue(plan: "ResumePlan | TrainPlan") -> int:
     print_start()
     start_workers_early(plan.experiment.collector.forks)
 
+    from deepracer_exp.reports.run_page import RunReport
     from deepracer_exp.training.run import run_training
 
     with warnings_on_stderr():
-        outcome = run_training(plan, plain_console(stderr=True))
+        outcome = run_training(plan, plain_console(stderr=True), report=RunReport())
     print_result(outcome, plan.experiment.tracking)
     return outcome.exit_code
 

@@ -15,10 +15,26 @@ from deepracer_exp.env.placement import box_corners_of, read_placements
 from deepracer_exp.env.setup import Course
 from deepracer_exp.lookup.next_steps import COMMAND, own_word
 from deepracer_exp.runs.files import BEST_LAP, LEARNING, METRICS, REPORT, TRACE, read_config
+from deepracer_exp.runs.result import FINISHED, STOPPED_EARLY
 from deepracer_exp.runs.trace import has_trace, missing_trace, read_others, read_trace
 from deepracer_exp.tracks.track import Track
+from deepracer_exp.training.result import TrainResult
+from deepracer_exp.training.trainer import Callback, Trainer
 
 logger = logging.getLogger("deepracer_exp")
+
+
+class RunReport(Callback):
+    """Draws the pictures of a run, and writes its report once it is over: a callback of the training."""
+
+    def on_train_end(self, trainer: Trainer) -> None:
+        """Draw best_lap.png and learning.png."""
+        write_pictures(trainer.folder.path, trainer.setup.courses)
+
+    def on_run_end(self, trainer: Trainer, result: TrainResult) -> None:
+        """Write report.html if `report` is on and the run is over, with at least one iteration."""
+        if trainer.experiment.report and trainer.iteration and result.status in (FINISHED, STOPPED_EARLY):
+            result.note = write_run_page(trainer.folder.path, trainer.experiment.car)
 
 
 def write_pictures(run_dir: Path, courses: Sequence[Course]) -> None:

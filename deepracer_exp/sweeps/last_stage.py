@@ -18,6 +18,7 @@ from optuna.trial import FrozenTrial
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL
 from deepracer_exp.lookup.resolve import StoredRun
+from deepracer_exp.reports.run_page import RunReport
 from deepracer_exp.runs.checkpoint_files import checkpoint_words
 from deepracer_exp.runs.files import is_run
 from deepracer_exp.runs.result import FAILED, INTERRUPTED
@@ -119,6 +120,7 @@ class LastStage:
         result = run_training(
             plan,
             callbacks=[_Clone(study, show)],
+            report=RunReport(),
             run_name=name,
             tags={STUDY: study},
             created=lambda folder: self._study.set_user_attr(_CLONE, {"of": of, "run_dir": folder.name}),

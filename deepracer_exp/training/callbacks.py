@@ -12,8 +12,7 @@ from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.lookup.resolve import StoredRun
-from deepracer_exp.reports.run_page import write_pictures, write_run_page
-from deepracer_exp.runs.result import FINISHED, STOPPED_EARLY, Ending
+from deepracer_exp.runs.result import Ending
 from deepracer_exp.stopping.rules import Decision, StoppingRule, build_rule
 from deepracer_exp.tracking.delivery import ENDS
 from deepracer_exp.tracking.metadata import END_TAG, joined
@@ -37,13 +36,15 @@ def standard_callbacks(
     tracker: Tracker,
     console: Console,
     users: Sequence[Callback] = (),
+    report: Callback | None = None,
     rival: StoredRun | None = None,
 ) -> list[Callback]:
     """Return the callbacks of a run in the order in which they are called.
 
     `users` are the caller's, called after evaluation and stopping rule and before anything is recorded: columns that
-    they add to `trainer.row` are recorded, and an iteration at which one raises is not. `rival` is the other run that
-    the evaluation races against, too; None: it has none, or its own snapshots.
+    they add to `trainer.row` are recorded, and an iteration at which one raises is not. `report` makes
+    pictures and pages of what is recorded, which are tracked like the rest. `rival` is the other run that the
+    evaluation races against, too; None: it has none, or its own snapshots.
 
     Raises:
         BadInput: files or values of the evaluation or the alerts cannot be used.
@@ -54,7 +55,7 @@ def standard_callbacks(
         *users,
         BudgetCallback(Alerts(experiment.budget), tracker),
         RecordCallback(),
-        ReportCallback(),
+        *([] if report is None else [report]),
         TrackingCallback(tracker, console),
         DisplayCallback(names, console),
     ]
@@ -206,19 +207,6 @@ class RecordCallback(Callback):
         """Put the last evaluation into the last row."""
         if trainer.evaluation is not None:
             trainer.folder.write_metrics([*trainer.folder.metrics()[:-1], trainer.row])
-
-
-class ReportCallback(Callback):
-    """Draws the pictures of a run, and writes its report once it is over."""
-
-    def on_train_end(self, trainer: Trainer) -> None:
-        """Draw best_lap.png and learning.png."""
-        write_pictures(trainer.folder.path, trainer.setup.courses)
-
-    def on_run_end(self, trainer: Trainer, result: TrainResult) -> None:
-        """Write report.html if `report` is on and the run is over, with at least one iteration."""
-        if trainer.experiment.report and trainer.iteration and result.status in (FINISHED, STOPPED_EARLY):
-            result.note = write_run_page(trainer.folder.path, trainer.experiment.car)
 
 
 class TrackingCallback(Callback):

@@ -72,6 +72,7 @@ def run_training(
     plan: TrainPlan | ResumePlan,
     console: Console | None = None,
     callbacks: Sequence[Callback] = (),
+    report: Callback | None = None,
     run_name: str | None = None,
     tags: Mapping[str, str] = MappingProxyType({}),
     created: Callable[[Path], None] | None = None,
@@ -83,6 +84,7 @@ def run_training(
         plan: of `plan_training`, `plan_clone` or `plan_resume`.
         console: shows the progress; None: nothing is shown.
         callbacks: called beside the standard ones, see `standard_callbacks`.
+        report: makes pictures and pages of the run, `reports.run_page.RunReport`; None: there are none.
         run_name: of the run in MLflow; None: from the reward function and the time.
         tags: of the run in MLflow, beside its own.
         created: called with the folder of a new run before it is recorded anywhere else.
@@ -97,7 +99,7 @@ def run_training(
     # Signals are caught from here on, so that Ctrl-C during the start leaves a whole folder, too.
     with Interruption(_printing(console)) as interruption:
         if isinstance(plan, ResumePlan):
-            return _run(_reopen(plan, console, callbacks, run_name, tags, projector), interruption)
+            return _run(_reopen(plan, console, callbacks, report, run_name, tags, projector), interruption)
         start = None
         if plan.parent is not None:
             start = read_parent(plan.parent, plan.experiment)
@@ -105,7 +107,7 @@ def run_training(
                 _printing(console)(note)
         setup = try_out(plan)
         memory = memory_needed(plan.experiment)
-        trainer = _begin(plan, setup, console, start, callbacks, run_name, tags, created, projector)
+        trainer = _begin(plan, setup, console, start, callbacks, report, run_name, tags, created, projector)
         _print_lines([*rounded(plan.experiment), *memory], console)
         return _run(trainer, interruption)
 
@@ -174,6 +176,7 @@ def _begin(
     console: Console,
     start: tuple[PolicyNetworks, Lineage | None] | None,
     callbacks: Sequence[Callback] = (),
+    report: Callback | None = None,
     run_name: str | None = None,
     tags: Mapping[str, str] = MappingProxyType({}),
     created: Callable[[Path], None] | None = None,
@@ -185,7 +188,7 @@ def _begin(
         rival = StoredRun(plan.rival.path, plan.rival.read_policy().path.name)
     tracker = open_tracker(experiment.tracking, Path(experiment.runs_dir), projector)
     names = _names(composition, joined(track_names(setup)), setup.reward.name)
-    every = standard_callbacks(experiment, setup, names, tracker, console, callbacks, rival)
+    every = standard_callbacks(experiment, setup, names, tracker, console, callbacks, report, rival)
     label = f"{names['track']}-{names['reward']}-seed{experiment.seed}"
     lineage = None if start is None else start[1]
     if lineage is not None:
@@ -252,6 +255,7 @@ def _reopen(
     plan: ResumePlan,
     console: Console,
     callbacks: Sequence[Callback],
+    report: Callback | None,
     run_name: str | None,
     tags: Mapping[str, str],
     projector: Projector | None,
@@ -269,7 +273,7 @@ def _reopen(
     _forget_damaged_best(run_dir, state)
     tracker = open_tracker(experiment.tracking, Path(experiment.runs_dir), projector)
     rival = kept_rival(experiment, run_dir)
-    every = standard_callbacks(experiment, setup, names, tracker, console, callbacks, rival)
+    every = standard_callbacks(experiment, setup, names, tracker, console, callbacks, report, rival)
     folder = RunFolder(run_dir)
     iteration = state["iteration"]
     try:

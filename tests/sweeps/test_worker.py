@@ -10,6 +10,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment
 from deepracer_exp.config.sweep import compose_sweep
+from deepracer_exp.reports import run_page
 from deepracer_exp.sweeps.queue.claims import TrialClaims
 from deepracer_exp.sweeps.queue.storage import open_storage
 from deepracer_exp.sweeps.queue.study import open_study
@@ -19,7 +20,6 @@ from deepracer_exp.sweeps.queue.worker_config import WorkerConfig
 from deepracer_exp.sweeps.search.space import SearchSpace
 from deepracer_exp.sweeps.trial import Trial
 from deepracer_exp.tracking.projector import Projector
-from deepracer_exp.training import callbacks
 from deepracer_exp.training.signals import Interruption
 
 SPACE = {
@@ -118,7 +118,7 @@ def test_a_run_whose_trial_is_taken_over_while_its_pictures_are_drawn_has_no_end
         time.sleep(1.0)
         until.signum = 15
 
-    monkeypatch.setattr(callbacks, "write_pictures", drawn)
+    monkeypatch.setattr(run_page, "write_pictures", drawn)
     one.work(until)
     (run,) = (tmp_path / "s").glob("*-seed*")
     assert (run / "metrics.jsonl").is_file()

@@ -18,6 +18,7 @@ from deepracer_exp.evaluation.evaluate import write_evaluation
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL
 from deepracer_exp.lookup.resolve import StoredRun
+from deepracer_exp.reports.run_page import RunReport
 from deepracer_exp.runs.checkpoint_files import kept_checkpoints
 from deepracer_exp.runs.files import (
     CHECKPOINTS,
@@ -246,7 +247,14 @@ class TrialRun(Callback):
             plan = self._planned([*lines, f"seed={experiment.seed + self._seed}"])
         title, tags = self._title_and_tags()
         return run_training(
-            plan, None, [self], run_name=title, tags=tags, created=self._begin, projector=self._projector
+            plan,
+            None,
+            [self],
+            RunReport(),
+            run_name=title,
+            tags=tags,
+            created=self._begin,
+            projector=self._projector,
         )
 
     def _resumed(self, run: SeedRun) -> TrainResult | None:
@@ -262,7 +270,9 @@ class TrialRun(Callback):
         title, tags = self._title_and_tags()
         try:
             plan = plan_resume(run_dir, [])
-            return run_training(plan, None, [self], run_name=title, tags=tags, projector=self._projector)
+            return run_training(
+                plan, None, [self], RunReport(), run_name=title, tags=tags, projector=self._projector
+            )
         except RunEnded:
             summary = read_object(run_dir / SUMMARY)
             ending = Ending.stored(summary)
