@@ -11,11 +11,11 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.fastest.lap import FastestLap, Question, kept_lap
 from deepracer_exp.lookup.next_steps import COMMAND, own_word
 from deepracer_exp.lookup.resolve import StoredRun
+from deepracer_exp.tracks.sectors import Sector, sectors_of
 from deepracer_exp.tracks.track import Track
 
 from .log_view import LogView
 from .once import once_per_view
-from .sectors import Sector, sectors_of
 from .statistics import Values
 
 CAUSES = ("line", "speed", "steering")

@@ -7,7 +7,9 @@ from statistics import NormalDist
 import numpy as np
 
 from deepracer_exp.errors import count
+from deepracer_exp.evaluation.zigzag import CONSOLE_CURE, CURE, ZIGZAG_DEG, ZIGZAG_PER_M, zigzag_in_words
 from deepracer_exp.runs.result import RunResult
+from deepracer_exp.tracks.sectors import Sector, sector_at, sectors_of
 
 from . import off_track
 from .beside import raced_beside
@@ -15,12 +17,12 @@ from .finding import LEAST_LOSS_PERCENT, LEAST_LOSS_S, Finding, Numbers, in_orde
 from .log_view import LEAST_LAPS, LogView, thirds
 from .off_track import JUDGEMENTS, OffTrackPlace, off_track_places
 from .others import costliest
-from .sectors import Sector, sector_at, sectors_now, sectors_of
+from .sectors import sectors_now
 from .statistics import wilson
 from .step_columns import begins_of, first_rows
 from .tables import CANDIDATE_LAPS, DENSE
 from .training_findings import training_findings
-from .zigzag import CONSOLE_CURE, CURE, ZIGZAG_DEG, ZIGZAG_PER_M, zigzag_in_words, zigzag_now
+from .zigzag import zigzag_now
 
 CRASH_PLACE_M = 1.0
 """Crashes no further than this from one place are at one object."""

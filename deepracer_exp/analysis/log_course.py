@@ -20,6 +20,7 @@ from deepracer_exp.config.track import TrackConfig
 from deepracer_exp.env.rules import wheels_on_road
 from deepracer_exp.errors import BadInput, nearest
 from deepracer_exp.runs.files import CONFIG, read_config
+from deepracer_exp.tracks.sectors import waypoint_positions
 from deepracer_exp.tracks.track import Track, TrackIndex, Tracks, world_track
 
 _SAMPLE = 2000
@@ -257,12 +258,6 @@ def estimated_course(name: str, steps: pd.DataFrame) -> Track | None:
         return Track.from_route(np.vstack([route, route[:1]]), name, title=title)
     except BadInput:
         return None
-
-
-def waypoint_positions(course: Track) -> NDArray[np.float64]:
-    """Return the lap position of each waypoint, 0 to 1."""
-    steps_m = np.linalg.norm(np.diff(course.waypoints, axis=0), axis=1)
-    return np.r_[0.0, np.cumsum(steps_m)] / course.length_m
 
 
 def directed(forward: Track, backward: Track, steps: pd.DataFrame) -> Track:

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 import pandas as pd
 
 from deepracer_exp.errors import count
+from deepracer_exp.evaluation.zigzag import zigzag_in_words
 from deepracer_exp.runs.result import RunResult
 
 from .against_fastest import loss_in_words
 from .beside import other_tracks, raced_beside
 from .charts.runs import run_folder
 from .log_view import LogView
-from .zigzag import zigzag_in_words, zigzag_now
+from .zigzag import zigzag_now
 
 NONE = "\N{EN DASH}"
 MOST_ITERATIONS = 300

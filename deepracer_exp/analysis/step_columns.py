@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from deepracer_exp.aws.logs.recording import TRAINING
 from deepracer_exp.compiled import njit
 from deepracer_exp.env.rules import lap_clock_s
+from deepracer_exp.evaluation.zigzag import STILL_M
 from deepracer_exp.tracks.track import Track
 
 from .statistics import MOST_ROWS, Values, subsample
@@ -47,8 +48,6 @@ CONTROL_PERIOD_S = 1 / 15
 """The service's, for recordings without two rows in succession."""
 FRONT_TO_REAR_AXLE_M = 0.14 + 0.081663
 """Distance from the logged point to the rear axle (deepracer-simapp: front point, rear wheels of the model)."""
-STILL_M = 0.01
-"""Movement below which a car has no direction of travel."""
 STOPPED = ("off_track", "crashed", "immobilized", "reversed")
 """Status of the rows after which a car is put back, or the episode ends."""
 FIRST_STEPS = 2

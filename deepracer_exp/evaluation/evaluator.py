@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -28,9 +27,7 @@ from deepracer_exp.tracks.track import directed_tracks
 from .head_to_head import RivalProtocol
 from .race_protocol import RaceProtocol
 from .result import HELD_OUT, USUAL, Evaluation, TrialGroup
-
-if TYPE_CHECKING:
-    from deepracer_exp.analysis.zigzag import ZigZag
+from .zigzag import DRIVES, ZigZag, zigzag_of
 
 OnStep = Callable[[Race, RaceProtocol, TensorDict], None]
 """Receives the cars, the protocol, and the policy's inputs and outputs in this step, [trials]."""
@@ -191,13 +188,8 @@ class Evaluator:
             for (track, condition), trials in rows.items()
         ]
 
-    def _zigzag(self, course: int, rows: NDArray[np.float64]) -> "ZigZag":
+    def _zigzag(self, course: int, rows: NDArray[np.float64]) -> ZigZag:
         """Measure the zig-zag of a trial: rows [T] with the columns `_DRIVEN` and whether the trial was running."""
-        from deepracer_exp.analysis.zigzag import (  # imports pandas, which only evaluations need
-            DRIVES,
-            zigzag_of,
-        )
-
         x_m, y_m, steering_deg, time_s, status, running = rows.T
         drives = np.isin(status, [STATUS_CODE[word] for word in DRIVES if word]) & (running > 0)
         track = self.race.setup.courses[course].tracks[0]

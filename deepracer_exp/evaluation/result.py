@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 from deepracer_exp.runs.result import RELIABLE
 
 from .race_protocol import Attempt
-
-if TYPE_CHECKING:
-    from deepracer_exp.analysis.zigzag import ZigZag
+from .zigzag import ZigZag, total_zigzag
 
 Metric = Literal["progress", "lap_time", "race_score", "reliable_lap"]
 Rank = tuple[float, float]
@@ -88,10 +86,8 @@ class TrialGroup:
         return sum(attempt.time_s for attempt in self.decided) / laps if laps else None
 
     @property
-    def zigzag(self) -> "ZigZag":
+    def zigzag(self) -> ZigZag:
         """The zig-zag on straights in all trials together."""
-        from deepracer_exp.analysis.zigzag import total_zigzag  # imports pandas, which only evaluations need
-
         return total_zigzag(self.zigzags)
 
     def rank(self, metric: Metric) -> Rank:

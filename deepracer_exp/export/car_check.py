@@ -17,7 +17,6 @@ from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from deepracer_exp.agents.actor_critic import PolicyNetworks
-from deepracer_exp.analysis.zigzag import CURE, ZIGZAG_DEG, ZIGZAG_PER_M, ZigZag
 from deepracer_exp.aws.models.car_archive import describe_commands
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.experiment import Experiment
@@ -38,6 +37,7 @@ from deepracer_exp.evaluation.film import LapRecorder, best_attempt, png
 from deepracer_exp.evaluation.plan import EvaluatePlan
 from deepracer_exp.evaluation.race_protocol import RaceProtocol
 from deepracer_exp.evaluation.result import USUAL, Evaluation, number
+from deepracer_exp.evaluation.zigzag import CURE, ZIGZAG_DEG, ZIGZAG_PER_M, ZigZag
 from deepracer_exp.files import atomic_write
 from deepracer_exp.reports.picture_changes import TriedPictures, pictures_sheet, try_pictures
 from deepracer_exp.runs.checkpoint_files import checkpoint_words

@@ -3,7 +3,7 @@ import pandas as pd
 import pytest
 
 from deepracer_exp.analysis.against_fastest import CAUSES, _in_sectors, by_cause
-from deepracer_exp.analysis.sectors import sectors_of
+from deepracer_exp.tracks.sectors import sectors_of
 from deepracer_exp.tracks.track import world_track
 
 COURSE = world_track("reinvent_base")

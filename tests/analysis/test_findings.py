@@ -15,13 +15,14 @@ from deepracer_exp.analysis.findings import findings
 from deepracer_exp.analysis.log_tables import NONE, best_laps, headline, iteration_rows
 from deepracer_exp.analysis.log_view import LEAST_EPISODES, LogView, prepare
 from deepracer_exp.analysis.off_track import neighbours
-from deepracer_exp.analysis.sectors import sectors_now, sectors_of
+from deepracer_exp.analysis.sectors import sectors_now
 from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.reports.log_report import LogPage, draw_sections, html
 from deepracer_exp.runs.recording import EVALUATION_COLUMNS, RunRecording
 from deepracer_exp.runs.result import RunResult
 from deepracer_exp.stopping.judge import LOG_RULE
+from deepracer_exp.tracks.sectors import sectors_of
 
 from .chart_layers import layers
 from .made_up import Drive, made_up_course, made_up_recording

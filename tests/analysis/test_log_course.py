@@ -9,12 +9,12 @@ import pytest
 
 from deepracer_exp.analysis.log_course import catalogue_track, find_courses, numbered_as_logged
 from deepracer_exp.analysis.log_view import prepare
-from deepracer_exp.analysis.sectors import sectors_of
 from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.aws.logs.recording import Recording
 from deepracer_exp.aws.worlds.routes import world_rows
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.errors import BadInput
+from deepracer_exp.tracks.sectors import sectors_of
 
 from .made_up import Drive, made_up_course, made_up_recording
 

@@ -8,15 +8,8 @@ import pytest
 
 from deepracer_exp.analysis.log_course import catalogue_track
 from deepracer_exp.analysis.log_view import prepare
-from deepracer_exp.analysis.sectors import (
-    SHORTEST_M,
-    Sector,
-    interval_times,
-    sector_at,
-    sectors_of,
-    time_lost,
-    times_by_sector,
-)
+from deepracer_exp.analysis.sectors import interval_times, time_lost, times_by_sector
+from deepracer_exp.tracks.sectors import SHORTEST_M, Sector, sector_at, sectors_of
 
 from .made_up import HZ, Drive, made_up_course, made_up_recording
 

@@ -7,7 +7,8 @@ import pytest
 
 from deepracer_exp.analysis.findings import findings
 from deepracer_exp.analysis.log_view import prepare
-from deepracer_exp.analysis.zigzag import CENTRED_DEG, ZigZag, total_zigzag, zigzag_in, zigzag_of
+from deepracer_exp.analysis.zigzag import zigzag_in
+from deepracer_exp.evaluation.zigzag import CENTRED_DEG, ZigZag, total_zigzag, zigzag_of
 from deepracer_exp.tracks.track import Track
 
 from .made_up import Drive, made_up_course, made_up_recording

@@ -9,13 +9,13 @@ from PIL import Image
 from rich.console import Console
 from tensordict import TensorDict
 
-from deepracer_exp.analysis.zigzag import ZigZag
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment
 from deepracer_exp.config.driving import CameraConfig
 from deepracer_exp.env.action_space import DiscreteActions
 from deepracer_exp.evaluation.evaluate import CAR, SIMULATOR
 from deepracer_exp.evaluation.race_protocol import Attempt
 from deepracer_exp.evaluation.result import USUAL, Evaluation, TrialGroup
+from deepracer_exp.evaluation.zigzag import ZigZag
 from deepracer_exp.export.car_archive import CarArchive, car_actions
 from deepracer_exp.export.car_check import CarCheck, CarLaps, print_check
 from deepracer_exp.export.car_converter import Conversion

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from deepracer_exp.analysis.log_view import LogView, closest_waypoints, thirds
 from deepracer_exp.analysis.once import once_per_view
-from deepracer_exp.analysis.sectors import sector_at, sectors_of
 from deepracer_exp.analysis.statistics import Values, means, totals
+from deepracer_exp.tracks.sectors import sector_at, sectors_of
 
 from .figure import Chart, Panel, heatmap, line
 from .maps import LEAST_STEPS, Grid, map_panel, waypoint_map_panel, waypoint_panel

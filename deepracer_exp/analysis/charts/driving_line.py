@@ -6,14 +6,15 @@ import numpy as np
 import pandas as pd
 
 from deepracer_exp.analysis.against_fastest import CAUSES, loss, lost_in_words
-from deepracer_exp.analysis.log_course import waypoint_positions
 from deepracer_exp.analysis.log_view import STARTING_STEPS, LogView, closest_waypoints
 from deepracer_exp.analysis.racing_line import center_line, minimum_curvature_line
-from deepracer_exp.analysis.sectors import sectors_now, sectors_of
+from deepracer_exp.analysis.sectors import sectors_now
 from deepracer_exp.analysis.statistics import MOST_ROWS, Values, means, quantiles, subsample
 from deepracer_exp.analysis.step_columns import SPEED_STEPS, first_rows
-from deepracer_exp.analysis.zigzag import CENTRED_DEG, zigzag_in_words, zigzag_now
+from deepracer_exp.analysis.zigzag import zigzag_now
 from deepracer_exp.errors import count
+from deepracer_exp.evaluation.zigzag import CENTRED_DEG, zigzag_in_words
+from deepracer_exp.tracks.sectors import sectors_of, waypoint_positions
 from deepracer_exp.tracks.track import Track
 
 from .figure import Chart, Layer, Panel, band, bars, color_range, colored_points, line, note, points

@@ -10,10 +10,11 @@ import pandas as pd
 from numpy.polynomial import Polynomial
 
 from deepracer_exp.analysis.log_view import LEAST_LAPS, LogView, thirds
-from deepracer_exp.analysis.sectors import Sector, sectors_of, time_lost
+from deepracer_exp.analysis.sectors import time_lost
 from deepracer_exp.analysis.statistics import Values, histogram, means, quantiles, subsample
 from deepracer_exp.analysis.step_columns import first_rows
 from deepracer_exp.errors import count
+from deepracer_exp.tracks.sectors import Sector, sectors_of
 
 from .figure import Chart, Layer, Panel, bars, colored_points, in_rows, line, mark, points
 from .style import BLUE, FAINT, GREEN, ORANGE, PALE, SKY, VERMILION
