@@ -43,8 +43,8 @@ from deepracer_exp.config.stopping import StoppingConfig
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.checkpoints import checkpoint_name, read_training
-from deepracer_exp.stopping.rules import Decision, build_rule
 from deepracer_exp.training.metrics import NOT_EVALUATED
+from deepracer_exp.training.stopping.stopping_rules import Decision, build_rule
 
 from .command import at_once, read_metrics, read_summary, trained
 from .fresh import TRIALS, Driven, drive

@@ -4,6 +4,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from deepracer_exp.training.stopping.stopping_rules import Decision, StoppingRule
+
     from .agents.algorithm import Algorithm, UpdateMetrics
     from .agents.ppo import PPO
     from .agents.schedules import Schedule
@@ -22,7 +24,6 @@ if TYPE_CHECKING:
     from .env.race_env import RaceEnv
     from .errors import BadInput, RunFailed
     from .evaluation.result import Evaluation
-    from .stopping.rules import Decision, StoppingRule
     from .tracking.tracker import Tracker
     from .training.result import TrainResult
     from .training.trainer import Callback, Trainer

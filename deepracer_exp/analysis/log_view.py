@@ -14,8 +14,8 @@ from deepracer_exp.aws.models.hyperparameters import Hyperparameters
 from deepracer_exp.env.placement import PlacedOthers, box_corners_of, rebuild_poses
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.recording import EvaluationRecording, RunRecording
-from deepracer_exp.stopping.judge import Convergence, convergence
 from deepracer_exp.tracks.track import Track
+from deepracer_exp.training.stopping.judge import Convergence, convergence
 
 from .log_course import (
     catalogue_track,

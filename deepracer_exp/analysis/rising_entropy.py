@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from deepracer_exp.stopping.rules import entropy_share
+from deepracer_exp.training.stopping.stopping_rules import entropy_share
 
 from .statistics import chance_of_rise, moving_average
 

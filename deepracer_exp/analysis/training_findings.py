@@ -11,7 +11,7 @@ import numpy as np
 from deepracer_exp.errors import count
 from deepracer_exp.runs.checkpoint_files import kept_checkpoints
 from deepracer_exp.runs.files import CHECKPOINTS
-from deepracer_exp.stopping.judge import (
+from deepracer_exp.training.stopping.judge import (
     POOR,
     Convergence,
     Overfitting,
@@ -19,7 +19,7 @@ from deepracer_exp.stopping.judge import (
     iterations_needed,
     overfitting,
 )
-from deepracer_exp.stopping.rules import entropy_share
+from deepracer_exp.training.stopping.stopping_rules import entropy_share
 
 from .charts.runs import run_folder
 from .finding import LEAST_LOSS_S, Finding, Numbers

@@ -13,11 +13,11 @@ from deepracer_exp.errors import RunFailed
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.result import Ending
-from deepracer_exp.stopping.rules import Decision, StoppingRule, build_rule
 from deepracer_exp.tracking.delivery import ENDS
 from deepracer_exp.tracking.metadata import END_TAG, joined
 from deepracer_exp.tracking.metrics import now_ms
 from deepracer_exp.tracking.tracker import FINISH_S, Tracker
+from deepracer_exp.training.stopping.stopping_rules import Decision, StoppingRule, build_rule
 
 from .budget import Alerts
 from .display import ProgressDisplay, RunHeader

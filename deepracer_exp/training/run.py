@@ -47,12 +47,12 @@ from deepracer_exp.runs.lineage import Lineage, read_lineage
 from deepracer_exp.runs.result import FINISHED, INTERRUPTED, Ending
 from deepracer_exp.scratch import folder_aside
 from deepracer_exp.sim.batch import CarBatch
-from deepracer_exp.stopping.rules import UNDECIDED
 from deepracer_exp.tracking.metadata import joined, lineage_tags, run_params, run_tags
 from deepracer_exp.tracking.metrics import now_ms
 from deepracer_exp.tracking.projector import Projector
 from deepracer_exp.tracking.tracker import open_tracker
 from deepracer_exp.tracking.tracking_file import TrackedRun, begin_again, read_tracked_run
+from deepracer_exp.training.stopping.stopping_rules import UNDECIDED
 
 from .budget import Budget
 from .callbacks import standard_callbacks

@@ -21,8 +21,8 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.reports.log_report import LogPage, draw_sections, html
 from deepracer_exp.runs.recording import EVALUATION_COLUMNS, RunRecording
 from deepracer_exp.runs.result import RunResult
-from deepracer_exp.stopping.judge import LOG_RULE
 from deepracer_exp.tracks.sectors import sectors_of
+from deepracer_exp.training.stopping.judge import LOG_RULE
 
 from .chart_layers import layers
 from .made_up import Drive, made_up_course, made_up_recording

@@ -17,7 +17,7 @@ from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.setup import build_courses
 from deepracer_exp.reports.run_page import write_pictures
 from deepracer_exp.runs.recording import read_run_recording
-from deepracer_exp.stopping.rules import build_rule
+from deepracer_exp.training.stopping.stopping_rules import build_rule
 from tests.waiting import wait_until
 
 NOT_LEARNING = (

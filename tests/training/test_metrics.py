@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from deepracer_exp.config.stopping import NoStopping, ReliableStopping
 from deepracer_exp.env.trace import PACKED, STATUS_CODE
-from deepracer_exp.stopping.rules import build_rule
 from deepracer_exp.training.metrics import Finished, Ranking, RunMetrics
+from deepracer_exp.training.stopping.stopping_rules import build_rule
 
 
 class Driven:

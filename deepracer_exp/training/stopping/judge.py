@@ -14,7 +14,7 @@ from pydantic import TypeAdapter, ValidationError
 from deepracer_exp.config.stopping import ConvergedRule, EntropyStopping, OverfittingRule, StoppingConfig
 from deepracer_exp.runs.result import RELIABLE
 
-from .rules import Decision, Row, TrendRule
+from .stopping_rules import Decision, Row, TrendRule
 
 if TYPE_CHECKING:
     import pandas as pd

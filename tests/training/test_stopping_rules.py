@@ -9,7 +9,7 @@ import pytest
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.stopping import StoppingConfig
 from deepracer_exp.errors import BadInput
-from deepracer_exp.stopping.rules import Decision, build_rule, entropy_share
+from deepracer_exp.training.stopping.stopping_rules import Decision, build_rule, entropy_share
 
 ACTIONS = 15
 LONG = 400
