@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from deepracer_exp.errors import BadInput
-from deepracer_exp.fastest.lap import FastestLap, Question, kept_lap
+from deepracer_exp.evaluation.fastest.fastest_lap import FastestLap, Question, kept_lap
 from deepracer_exp.lookup.next_steps import COMMAND, own_word
 from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.tracks.sectors import Sector, sectors_of

@@ -13,7 +13,7 @@ from deepracer_exp.aws.models.model_metadata import Action
 from deepracer_exp.config.bounds import FEWEST_ACTIONS, MOST_ACTIONS
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.errors import BadInput, count
-from deepracer_exp.fastest.lap import FastestLap
+from deepracer_exp.evaluation.fastest.fastest_lap import FastestLap
 
 from .log_view import prepare, prepare_races
 from .statistics import Values

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from deepracer_exp.config.experiment import Experiment
-    from deepracer_exp.fastest.lap import FastestLap
+    from deepracer_exp.evaluation.fastest.fastest_lap import FastestLap
     from deepracer_exp.tracks.track import Track
 
 _EPILOG = """\
@@ -193,8 +193,8 @@ def search_fastest(experiment: "Experiment", track: "Track") -> "FastestLap":
     """
     from rich.progress import Progress, TimeRemainingColumn
 
-    from deepracer_exp.fastest.lap import Question, fastest_lap, kept_lap
-    from deepracer_exp.fastest.search import PASSES
+    from deepracer_exp.evaluation.fastest.fastest_lap import Question, fastest_lap, kept_lap
+    from deepracer_exp.evaluation.fastest.lap_search import PASSES
 
     question = Question.of(experiment, track)
     kept = kept_lap(question)
@@ -225,7 +225,7 @@ def search_fastest(experiment: "Experiment", track: "Track") -> "FastestLap":
 
 
 def _print_lap(lap: "FastestLap", experiment: "Experiment") -> None:
-    from deepracer_exp.fastest.lap import command_limits
+    from deepracer_exp.evaluation.fastest.fastest_lap import command_limits
 
     speed, (low, high) = lap.column("speed_mps"), command_limits(experiment)
     print(

@@ -12,7 +12,7 @@ from deepracer_exp.commands.actions import FREE, write_lap_actions
 from deepracer_exp.commands.tracks import experiment_on
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.action_space import build_action_space, describe_actions
-from deepracer_exp.fastest.lap import COLUMNS, FastestLap, Question, _keep
+from deepracer_exp.evaluation.fastest.fastest_lap import COLUMNS, FastestLap, Question, _keep
 from deepracer_exp.sweeps.plan import plan_sweep
 from tests.aws.made_up_logs import write_run_as_logs
 from tests.conftest import refused

@@ -31,7 +31,7 @@ from deepracer_exp.sim.ability import ability_of
 from deepracer_exp.tracks.line_time import Ability, fastest_line
 from deepracer_exp.tracks.track import Track
 
-from .search import OnRound, Search, lap_time_s
+from .lap_search import OnRound, Search, lap_time_s
 
 Floats = NDArray[np.float64]
 

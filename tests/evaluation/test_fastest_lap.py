@@ -9,10 +9,10 @@ from deepracer_exp.commands.tracks import search_fastest
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.rules import lap_clock_s
 from deepracer_exp.errors import BadInput, RunFailed
-from deepracer_exp.fastest import lap as fastest
-from deepracer_exp.fastest.lap import FastestLap, Question, fastest_lap, kept_lap
-from deepracer_exp.fastest.optimal_control import Aim, _backward
-from deepracer_exp.fastest.search import Search
+from deepracer_exp.evaluation.fastest import fastest_lap as fastest
+from deepracer_exp.evaluation.fastest.fastest_lap import FastestLap, Question, fastest_lap, kept_lap
+from deepracer_exp.evaluation.fastest.lap_search import Search
+from deepracer_exp.evaluation.fastest.optimal_control import Aim, _backward
 from deepracer_exp.tracks.track import Track
 
 FAST = ("action_space=continuous", "action_space.speed.low=0.1", "action_space.speed.high=4")
