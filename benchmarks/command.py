@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import yaml
 
-from deepracer_exp.runs.result import FINISHED, STOPPED_EARLY
+from deepracer_exp.runs.run_result import FINISHED, STOPPED_EARLY
 
 Result = TypeVar("Result")
 

@@ -12,7 +12,7 @@ from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation
-from deepracer_exp.lookup.resolve import StoredRun
+from deepracer_exp.runs.stored_run import StoredRun
 
 TRIALS = 64
 _SEED = 20_181_128

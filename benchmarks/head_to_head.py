@@ -28,7 +28,7 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.lookup.resolve import StoredRun
+from deepracer_exp.runs.stored_run import StoredRun
 
 from .command import trained
 from .report import benchmark_parser, number, table, with_exit_code, write_json

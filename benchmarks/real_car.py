@@ -53,7 +53,7 @@ from deepracer_exp.evaluation.result import NOTHING, USUAL
 from deepracer_exp.export.car_archive import car_archive
 from deepracer_exp.export.car_converter import NEEDED, Conversion, compare_in_openvino, has_openvino
 from deepracer_exp.export.onnx import DeployedPolicy
-from deepracer_exp.lookup.resolve import StoredRun
+from deepracer_exp.runs.stored_run import StoredRun
 
 from .camera import read_frames
 from .command import at_once, read_summary, trained

@@ -36,7 +36,7 @@ from typing import Any
 
 import numpy as np
 
-from deepracer_exp.runs.files import CONFIG, HEARTBEAT, METRICS
+from deepracer_exp.runs.run_files import CONFIG, HEARTBEAT, METRICS
 
 from .report import benchmark_parser, number, table, write_json
 

@@ -20,10 +20,10 @@ from deepracer_exp.env.setup import build_setup
 from deepracer_exp.evaluation.evaluate import evaluate_run
 from deepracer_exp.evaluation.plan import plan_evaluation
 from deepracer_exp.evaluation.result import Evaluation
-from deepracer_exp.lookup.resolve import resolve
 from deepracer_exp.reports.run_page import RunReport
-from deepracer_exp.runs.files import METRICS, SUMMARY, read_config, read_metrics, read_object
 from deepracer_exp.runs.recording import read_run_recording
+from deepracer_exp.runs.run_files import METRICS, SUMMARY, read_config, read_metrics, read_object
+from deepracer_exp.tracking.resolve import resolve
 from deepracer_exp.training.plan import plan_resume, plan_training
 from deepracer_exp.training.result import TrainResult
 from deepracer_exp.training.run import run_training

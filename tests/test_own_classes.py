@@ -17,7 +17,7 @@ from deepracer_exp.config import acting, own_class
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.options import options
 from deepracer_exp.config.own_class import build_own
-from deepracer_exp.lookup.next_steps import command_line, next_steps
+from deepracer_exp.runs.next_steps import command_line, next_steps
 
 from .conftest import IN_PROCESS, call_in
 

@@ -13,12 +13,12 @@ from deepracer_exp.aws.worlds.routes import read_knots, read_route
 from deepracer_exp.config.driving import RewardConfig
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import read_yaml
-from deepracer_exp.lookup.best import read_best_of_sweep
 from deepracer_exp.rewards.source import load_reward_source
+from deepracer_exp.runs.best_run import read_best_of_sweep
 from deepracer_exp.runs.checkpoint_files import pinned, verify
-from deepracer_exp.runs.files import read_config, read_metrics
 from deepracer_exp.runs.labels import read_labels
 from deepracer_exp.runs.recording import read_log
+from deepracer_exp.runs.run_files import read_config, read_metrics
 from deepracer_exp.runs.trace import read_evaluation_others, read_trace
 from tests.hostile_files import KINDS, PLACES, make
 

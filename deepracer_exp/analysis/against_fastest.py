@@ -9,8 +9,8 @@ import pandas as pd
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.fastest.fastest_lap import FastestLap, Question, kept_lap
-from deepracer_exp.lookup.next_steps import COMMAND, own_word
-from deepracer_exp.lookup.resolve import StoredRun
+from deepracer_exp.runs.next_steps import COMMAND, own_word
+from deepracer_exp.runs.stored_run import StoredRun
 from deepracer_exp.tracks.sectors import Sector, sectors_of
 from deepracer_exp.tracks.track import Track
 

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from deepracer_exp.config.stored import ABSENT as NOTHING
-from deepracer_exp.runs.files import RunRecord
-from deepracer_exp.runs.result import FIGURES, result_of
+from deepracer_exp.runs.run_files import RunRecord
+from deepracer_exp.runs.run_result import FIGURES, result_of
 
 from .charts.style import shortened
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from deepracer_exp.errors import count
 from deepracer_exp.evaluation.zigzag import CONSOLE_CURE, CURE, ZIGZAG_DEG, ZIGZAG_PER_M, zigzag_in_words
-from deepracer_exp.runs.result import RunResult
+from deepracer_exp.runs.run_result import RunResult
 from deepracer_exp.tracks.sectors import Sector, sector_at, sectors_of
 
 from . import off_track

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from deepracer_exp.runs.files import RunRecord
+from deepracer_exp.runs.run_files import RunRecord
 
 from .evidence import iqm_band
 from .groups import RunGroup

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from deepracer_exp.errors import count
-from deepracer_exp.runs.result import result_of
+from deepracer_exp.runs.run_result import result_of
 
 from .evidence import Estimate, Interval
 from .group_curves import curves_table

@@ -11,9 +11,9 @@ import numpy as np
 
 from deepracer_exp.analysis.comparison import value_text
 from deepracer_exp.files import read_yaml
-from deepracer_exp.runs.files import OVERRIDES, WRITTEN, RunRecord
 from deepracer_exp.runs.lineage import course_names, run_differences
-from deepracer_exp.runs.result import FIGURES, result_of
+from deepracer_exp.runs.run_files import OVERRIDES, WRITTEN, RunRecord
+from deepracer_exp.runs.run_result import FIGURES, result_of
 
 from .evidence import Difference, Estimate, difference, estimate, interquartile_mean
 from .statistics import Values

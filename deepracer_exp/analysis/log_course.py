@@ -19,7 +19,7 @@ from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.config.track import TrackConfig
 from deepracer_exp.env.rules import wheels_on_road
 from deepracer_exp.errors import BadInput, nearest
-from deepracer_exp.runs.files import CONFIG, read_config
+from deepracer_exp.runs.run_files import CONFIG, read_config
 from deepracer_exp.tracks.sectors import waypoint_positions
 from deepracer_exp.tracks.track import Track, TrackIndex, Tracks, world_track
 

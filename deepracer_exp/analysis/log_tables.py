@@ -8,7 +8,7 @@ import pandas as pd
 
 from deepracer_exp.errors import count
 from deepracer_exp.evaluation.zigzag import zigzag_in_words
-from deepracer_exp.runs.result import RunResult
+from deepracer_exp.runs.run_result import RunResult
 
 from .against_fastest import loss_in_words
 from .beside import other_tracks, raced_beside

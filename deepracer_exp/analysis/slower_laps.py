@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from deepracer_exp.runs.result import RELIABLE
+from deepracer_exp.runs.run_result import RELIABLE
 
 from .statistics import Values, chance_of_rise
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from deepracer_exp.errors import count
 from deepracer_exp.runs.checkpoint_files import kept_checkpoints
-from deepracer_exp.runs.files import CHECKPOINTS
+from deepracer_exp.runs.run_files import CHECKPOINTS
 from deepracer_exp.training.stopping.judge import (
     POOR,
     Convergence,

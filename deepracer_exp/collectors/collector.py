@@ -23,7 +23,7 @@ from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import BadInput, RunFailed, count
 from deepracer_exp.patience import wait_patiently
 from deepracer_exp.runs.crash_dump import read_crash_dump
-from deepracer_exp.runs.files import HEARTBEAT, LOG
+from deepracer_exp.runs.run_files import HEARTBEAT, LOG
 from deepracer_exp.sim.batch import cores
 
 from .sampling import SamplingPolicy

@@ -23,7 +23,7 @@ from deepracer_exp.errors import RunFailed
 from deepracer_exp.lifeline import end_with_owner
 from deepracer_exp.rewards.prints import RewardPrints
 from deepracer_exp.runs.crash_dump import write_crash_dump
-from deepracer_exp.runs.files import REWARD_PRINTS
+from deepracer_exp.runs.run_files import REWARD_PRINTS
 
 from .sampling import NOISE
 

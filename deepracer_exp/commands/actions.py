@@ -176,7 +176,7 @@ def _complete(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[st
 
 def _source(what: str, overrides: list[str], track: str | None) -> _Source:
     from deepracer_exp.config.options import options
-    from deepracer_exp.runs.files import is_run
+    from deepracer_exp.runs.run_files import is_run
 
     place = existing_logs(what)
     is_route = place is not None and place.suffix in ROUTES

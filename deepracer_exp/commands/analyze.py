@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deepracer_exp.errors import BadInput, count, writing
-from deepracer_exp.runs.files import REPORT
+from deepracer_exp.runs.run_files import REPORT
 
 from .arguments import add_command, add_run, read_stores, runs_and_overrides
 from .output import check_file
@@ -105,8 +105,8 @@ def _analyze(args: argparse.Namespace) -> int:
     from deepracer_exp.analysis.reward_replay import replay_reward
     from deepracer_exp.analysis.reward_terms import run_terms
     from deepracer_exp.reports.log_report import LogPage, write_log_page
-    from deepracer_exp.runs.files import read_config
     from deepracer_exp.runs.recording import is_traced_run, read_log
+    from deepracer_exp.runs.run_files import read_config
 
     log = read_log(place)
     if _wants_laps_only(args):

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deepracer_exp.errors import BadInput, nearest, reading
-from deepracer_exp.runs.files import BEST, RUN, run_folders, shortest_names
+from deepracer_exp.runs.run_files import BEST, RUN, run_folders, shortest_names
 
 if TYPE_CHECKING:
-    from deepracer_exp.lookup.resolve import StoredRun
+    from deepracer_exp.runs.stored_run import StoredRun
 
 STORES = ("runs_dir", "tracking.uri")
 """The folder of runs, and the MLflow store in which ids and aliases are looked up."""
@@ -127,8 +127,8 @@ class Stores:
     """Values of the other keys that the command takes."""
 
     def find(self, run: str) -> "StoredRun":
-        """Find a run; arguments and errors as for `lookup.resolve.resolve`."""
-        from deepracer_exp.lookup.resolve import resolve
+        """Find a run; arguments and errors as for `tracking.resolve.resolve`."""
+        from deepracer_exp.tracking.resolve import resolve
 
         return resolve(run, self.runs_dir, self.uri)
 

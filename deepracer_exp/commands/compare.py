@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deepracer_exp.errors import BadInput, count
-from deepracer_exp.runs.files import CONFIG, is_run
+from deepracer_exp.runs.run_files import CONFIG, is_run
 
 from .arguments import STORES, Stores, add_command, add_run, read_stores, runs_and_overrides
 from .compare_runs import compare_runs

@@ -9,8 +9,8 @@ from string import ascii_uppercase
 from typing import TYPE_CHECKING
 
 from deepracer_exp.errors import BadInput
-from deepracer_exp.runs.files import METRICS
-from deepracer_exp.runs.result import TRAINING_LAPS
+from deepracer_exp.runs.run_files import METRICS
+from deepracer_exp.runs.run_result import TRAINING_LAPS
 
 from .output import print_table, table_console
 from .pages import Item, end_with_page, light, write_comparison_page, write_laps
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from deepracer_exp.analysis.charts.figure import Chart
     from deepracer_exp.analysis.groups import RunGroup
     from deepracer_exp.analysis.log_tables import Table
-    from deepracer_exp.runs.files import RunRecord
+    from deepracer_exp.runs.run_files import RunRecord
 
 _RUNS = "Runs"
 _MOST_GROUPS = 12
@@ -54,7 +54,7 @@ def compare_runs(args: argparse.Namespace, items: Sequence[Item]) -> int:
     if args.format == "table" or args.output is not None:
         _show(args, items, _best(groups), len(groups), records)
     if args.replay is not None:
-        from deepracer_exp.lookup.resolve import StoredRun
+        from deepracer_exp.runs.stored_run import StoredRun
 
         stored = [StoredRun(record.path).with_policy() for record in records]
 
@@ -71,7 +71,7 @@ def compare_runs(args: argparse.Namespace, items: Sequence[Item]) -> int:
 def _groups(items: Sequence[Item]) -> "list[RunGroup]":
     """Return the groups of runs; an experiment among several keeps its name."""
     from deepracer_exp.analysis.groups import RunGroup, group_runs
-    from deepracer_exp.runs.files import read_record
+    from deepracer_exp.runs.run_files import read_record
 
     records: dict[Path, RunRecord] = {}
 

@@ -255,7 +255,7 @@ def _replay_laps(args: argparse.Namespace) -> int:
     plan, rival, view = _planned(args, runs[0], overrides), None, None
     _refuse_rival(plan, "--replay")
     if runs[1:]:
-        from deepracer_exp.runs.files import is_run
+        from deepracer_exp.runs.run_files import is_run
 
         place = Path(runs[1]).expanduser()
         if place.exists() and not is_run(place):
@@ -264,7 +264,7 @@ def _replay_laps(args: argparse.Namespace) -> int:
 
             view = prepare_races(read_recording(place))
         else:
-            from deepracer_exp.lookup.resolve import resolve
+            from deepracer_exp.tracking.resolve import resolve
 
             rival = resolve(runs[1], Path(plan.config.runs_dir), plan.config.tracking.uri).with_policy()
 

@@ -116,7 +116,7 @@ def _holds_model(path: str) -> bool:
 def _import_model(args: argparse.Namespace) -> int:
     import zipfile
 
-    from deepracer_exp.lookup.next_steps import own_word
+    from deepracer_exp.runs.next_steps import own_word
 
     from .import_model import import_model
 

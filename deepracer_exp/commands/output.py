@@ -12,8 +12,16 @@ from typing import TYPE_CHECKING, Any
 
 from deepracer_exp.cache import compiled_folder
 from deepracer_exp.errors import BadInput, count
-from deepracer_exp.runs.files import BEST_LAP, CHECKPOINTS, LEARNING, METRICS, REPORT, full_name, read_metrics
-from deepracer_exp.runs.result import FAILED, RELIABLE, fastest_reliable, why_not_fastest
+from deepracer_exp.runs.run_files import (
+    BEST_LAP,
+    CHECKPOINTS,
+    LEARNING,
+    METRICS,
+    REPORT,
+    full_name,
+    read_metrics,
+)
+from deepracer_exp.runs.run_result import FAILED, RELIABLE, fastest_reliable, why_not_fastest
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -129,8 +137,8 @@ def warn_of_compiling() -> None:
 def print_result(outcome: "TrainResult", tracking: "TrackingConfig") -> None:
     """Print how a run ended, where its results are, and what to do next."""
     from deepracer_exp.config.running import MLflowTracking
-    from deepracer_exp.lookup.next_steps import COMMAND, next_steps, open_report
-    from deepracer_exp.runs.result import result_of
+    from deepracer_exp.runs.next_steps import COMMAND, next_steps, open_report
+    from deepracer_exp.runs.run_result import result_of
 
     summary = outcome.summary
     if outcome.status == FAILED:
@@ -203,8 +211,8 @@ def _print_groups(runs: "Sequence[Path]") -> None:
     """Print the tables of groups, where one of them has several runs."""
     from deepracer_exp.analysis.group_tables import differences_table, scored, sentences, title_of
     from deepracer_exp.analysis.groups import compared, group_runs
-    from deepracer_exp.lookup.next_steps import own_word
-    from deepracer_exp.runs.files import read_head
+    from deepracer_exp.runs.next_steps import own_word
+    from deepracer_exp.runs.run_files import read_head
 
     groups = group_runs((None, read_head(run)) for run in runs) if len(runs) > 1 else []
     if len(groups) in (0, len(runs)):
@@ -223,7 +231,7 @@ def _print_groups(runs: "Sequence[Path]") -> None:
 def _print_unrecorded(outcomes: "Sequence[TrainResult]", tracking: "TrackingConfig") -> None:
     """Say last, on standard error, what was not recorded, and how to send it later."""
     from deepracer_exp.config.running import MLflowTracking
-    from deepracer_exp.lookup.next_steps import own_word
+    from deepracer_exp.runs.next_steps import own_word
 
     lacking = [outcome for outcome in outcomes if outcome.unrecorded is not None]
     for reason in dict.fromkeys(outcome.unrecorded for outcome in lacking):
@@ -239,7 +247,7 @@ def _print_unrecorded(outcomes: "Sequence[TrainResult]", tracking: "TrackingConf
 
 def print_unsent(study: "Path") -> None:
     """Say on standard error of how many runs of a study MLflow lacks something, and how to send it later."""
-    from deepracer_exp.runs.files import CONFIG
+    from deepracer_exp.runs.run_files import CONFIG
     from deepracer_exp.tracking.delivery import undelivered
     from deepracer_exp.tracking.store import resolve_store
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from deepracer_exp.errors import BadInput, reading, writing
 from deepracer_exp.files import LOG_BYTES, open_user_file
-from deepracer_exp.runs.files import is_run
+from deepracer_exp.runs.run_files import is_run
 
 from .arguments import Stores
 
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from deepracer_exp.analysis.charts.figure import Chart
     from deepracer_exp.analysis.log_tables import Table
     from deepracer_exp.analysis.log_view import LogView
-    from deepracer_exp.lookup.resolve import StoredRun
     from deepracer_exp.reports.lap_replay import ReplayedLap
+    from deepracer_exp.runs.stored_run import StoredRun
 
 _ACCEPTED = "logs of the service, or a run"
 

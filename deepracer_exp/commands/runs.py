@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deepracer_exp.errors import BadInput, count
-from deepracer_exp.runs.files import full_name
+from deepracer_exp.runs.run_files import full_name
 
 from .arguments import (
     STORES,
@@ -226,9 +226,9 @@ def _promote(args: argparse.Namespace) -> int:
     from deepracer_exp.config.driving import ObservationConfig
     from deepracer_exp.config.own_class import OF_POLICY, allow_given
     from deepracer_exp.config.parse import parse_config
-    from deepracer_exp.lookup.next_steps import command_line
     from deepracer_exp.runs.checkpoint_files import find_checkpoint
-    from deepracer_exp.runs.files import read_config
+    from deepracer_exp.runs.next_steps import command_line
+    from deepracer_exp.runs.run_files import read_config
     from deepracer_exp.tracking.registry import check_alias, check_model, promote
 
     name, overrides = run_and_overrides(args)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deepracer_exp.errors import BadInput, count
-from deepracer_exp.runs.files import full_name, run_folders
+from deepracer_exp.runs.run_files import full_name, run_folders
 
 from .arguments import (
     STORES,
@@ -124,8 +124,8 @@ class _Target:
 
     def write(self, labels: "Labels") -> None:
         """Write labels into the folder and into MLflow; warn if MLflow lacks them."""
-        from deepracer_exp.lookup.next_steps import own_word
         from deepracer_exp.runs.labels import write_labels
+        from deepracer_exp.runs.next_steps import own_word
         from deepracer_exp.tracking.delivery import deliver_labels
         from deepracer_exp.tracking.store import has_store, resolve_store
         from deepracer_exp.tracking.tracking_file import note_problem, read_tracked_run
@@ -148,7 +148,7 @@ class _Target:
 
 
 def _target(name: str, stores: Stores) -> _Target:
-    from deepracer_exp.runs.files import read_run_id
+    from deepracer_exp.runs.run_files import read_run_id
     from deepracer_exp.tracking.store import is_run_id
 
     try:
@@ -206,7 +206,7 @@ def _delete(args: argparse.Namespace) -> int:
     from rich.filesize import decimal
 
     from deepracer_exp.runs.clean import deletable, remove, total_bytes
-    from deepracer_exp.runs.files import read_run_id
+    from deepracer_exp.runs.run_files import read_run_id
     from deepracer_exp.tracking.delivery import marked_deleted
 
     runs, overrides = runs_and_overrides(args)

@@ -108,7 +108,7 @@ def _folded(rows: "Sequence[Row]", runs_dir: Path) -> "Sequence[Row]":
     if not studies:
         return rows
 
-    from deepracer_exp.lookup.best import read_best_of_sweep
+    from deepracer_exp.runs.best_run import read_best_of_sweep
 
     best_runs = {}
     for study in studies:
@@ -172,7 +172,7 @@ def _print_table(rows: "Sequence[Row]") -> None:
     from rich.table import Table
 
     from deepracer_exp.runs.labels import USER_TAG
-    from deepracer_exp.runs.result import TRAINING_LAPS
+    from deepracer_exp.runs.run_result import TRAINING_LAPS
 
     console = table_console()
     table = Table("run", "state", box=None, pad_edge=False, header_style="dim")

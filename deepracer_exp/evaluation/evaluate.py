@@ -24,7 +24,7 @@ from deepracer_exp.errors import RunFailed, count, writing
 from deepracer_exp.files import atomic_write
 from deepracer_exp.runs.checkpoint_files import checkpoint_words
 from deepracer_exp.runs.checkpoints import StoredPolicy
-from deepracer_exp.runs.files import EVALUATIONS, FILMS
+from deepracer_exp.runs.run_files import EVALUATIONS, FILMS
 from deepracer_exp.tracking.delivery import deliver_evaluation
 from deepracer_exp.tracking.metrics import evaluate_metric, track_labels
 from deepracer_exp.tracks.boards import Standing, standings, what_it_sees

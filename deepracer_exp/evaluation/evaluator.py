@@ -20,8 +20,8 @@ from deepracer_exp.env.race import Race
 from deepracer_exp.env.real_car import as_the_car, require_car
 from deepracer_exp.env.setup import Course, build_setup
 from deepracer_exp.env.trace import PACKED, STATUS_CODE
-from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.rewards.source import NO_REWARD
+from deepracer_exp.runs.stored_run import StoredRun
 from deepracer_exp.tracks.track import directed_tracks
 
 from .head_to_head import RivalProtocol

@@ -10,8 +10,10 @@ from deepracer_exp.config.parse import import_own_classes
 from deepracer_exp.config.stored import EvaluationRequest
 from deepracer_exp.env.real_car import require_car
 from deepracer_exp.errors import BadInput
-from deepracer_exp.lookup.resolve import StoredRun, resolve
-from deepracer_exp.lookup.rival import find_rival, kept_rival
+from deepracer_exp.runs.stored_run import StoredRun
+from deepracer_exp.tracking.resolve import resolve
+
+from .rival_run import find_rival, kept_rival
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from deepracer_exp.runs.result import RELIABLE
+from deepracer_exp.runs.run_result import RELIABLE
 
 from .race_protocol import Attempt
 from .zigzag import ZigZag, total_zigzag

@@ -18,7 +18,7 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.learning import SACConfig
 from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.errors import BadInput, count
-from deepracer_exp.lookup.resolve import StoredRun
+from deepracer_exp.runs.stored_run import StoredRun
 from deepracer_exp.validation.aws_rules import text_findings
 
 from .written import Written, reward_text, write_files

@@ -22,9 +22,9 @@ from deepracer_exp.config.named import network_overrides, services_layers
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.errors import BadInput
-from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.checkpoints import StoredPolicy
-from deepracer_exp.runs.result import read_result
+from deepracer_exp.runs.run_result import read_result
+from deepracer_exp.runs.stored_run import StoredRun
 from deepracer_exp.tracks.track import Track
 
 from .aws_files import aws_files, services_metadata

@@ -33,8 +33,8 @@ from deepracer_exp.config.learning import CNNConfig
 from deepracer_exp.env.action_space import ActionSpace, ContinuousActions, build_action_space, metadata_of
 from deepracer_exp.env.real_car import check_car
 from deepracer_exp.errors import BadInput
-from deepracer_exp.lookup.next_steps import own_word
-from deepracer_exp.lookup.resolve import StoredRun
+from deepracer_exp.runs.next_steps import own_word
+from deepracer_exp.runs.stored_run import StoredRun
 
 from .aws_files import sensor_keys
 from .aws_model import services_kind

@@ -41,8 +41,8 @@ from deepracer_exp.evaluation.zigzag import CURE, ZIGZAG_DEG, ZIGZAG_PER_M, ZigZ
 from deepracer_exp.files import atomic_write
 from deepracer_exp.reports.picture_changes import TriedPictures, pictures_sheet, try_pictures
 from deepracer_exp.runs.checkpoint_files import checkpoint_words
-from deepracer_exp.runs.files import FILMS
-from deepracer_exp.runs.result import RELIABLE
+from deepracer_exp.runs.run_files import FILMS
+from deepracer_exp.runs.run_result import RELIABLE
 
 from .car_archive import CarArchive, car_archive
 from .car_converter import NEEDED, Conversion, compare_in_openvino, has_openvino

@@ -20,7 +20,7 @@ from deepracer_exp.aws.models.car_archive import GRAPH
 from deepracer_exp.aws.models.graph_def import INPUTS, POLICY
 from deepracer_exp.aws.models.model_metadata import ModelMetadata
 from deepracer_exp.errors import BadInput
-from deepracer_exp.lookup.resolve import StoredRun
+from deepracer_exp.runs.stored_run import StoredRun
 
 from .car_archive import CarArchive, export_car
 from .onnx import DeployedPolicy

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from deepracer_exp.lookup.resolve import StoredRun
-from deepracer_exp.runs.files import EXPORTS
+from deepracer_exp.runs.run_files import EXPORTS
+from deepracer_exp.runs.stored_run import StoredRun
 
 from .aws_files import export_files
 from .aws_model import export_model

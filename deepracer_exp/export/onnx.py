@@ -17,7 +17,7 @@ from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.env.action_space import ActionSpace, DiscreteActions, build_action_space
 from deepracer_exp.env.observation import feature_names, observation_shape
 from deepracer_exp.errors import BadInput, RunFailed
-from deepracer_exp.lookup.resolve import StoredRun
+from deepracer_exp.runs.stored_run import StoredRun
 
 from .written import Written, checkpoint_line, write_file
 

@@ -5,9 +5,9 @@ from pathlib import Path
 
 from deepracer_exp.errors import writing
 from deepracer_exp.files import atomic_write, read_text
-from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.checkpoints import StoredPolicy
-from deepracer_exp.runs.files import REWARD
+from deepracer_exp.runs.run_files import REWARD
+from deepracer_exp.runs.stored_run import StoredRun
 
 Written = tuple[Iterable[Path], list[str]]
 """Files or folders, and lines on them."""

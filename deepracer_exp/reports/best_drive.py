@@ -10,10 +10,10 @@ from deepracer_exp.config.own_class import OF_POLICY, named_again
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.film import Lap, LapRecorder, best_attempt, drive_best_lap
-from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.reports.page import Glimpse
 from deepracer_exp.runs.checkpoint_files import checkpoint_words, kept_checkpoints
-from deepracer_exp.runs.files import CHECKPOINTS, read_config
+from deepracer_exp.runs.run_files import CHECKPOINTS, read_config
+from deepracer_exp.runs.stored_run import StoredRun
 
 from .sight import glimpses
 

@@ -28,7 +28,6 @@ from deepracer_exp.evaluation.result import (
     Rank,
     number,
 )
-from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.reports.comparison_page import write_comparison
 from deepracer_exp.runs.checkpoint_files import (
     LINKS,
@@ -38,7 +37,8 @@ from deepracer_exp.runs.checkpoint_files import (
     pinned,
 )
 from deepracer_exp.runs.checkpoints import check, read_policy
-from deepracer_exp.runs.result import BOTH, CRITERIA, of_conditions
+from deepracer_exp.runs.run_result import BOTH, CRITERIA, of_conditions
+from deepracer_exp.runs.stored_run import StoredRun
 
 logger = logging.getLogger("deepracer_exp")
 

@@ -15,10 +15,10 @@ from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.film import LapRecorder, best_attempt
 from deepracer_exp.evaluation.race_protocol import Attempt
 from deepracer_exp.evaluation.result import USUAL, Evaluation
-from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.reports.lap_replay import ReplayedLap, is_same_start
 from deepracer_exp.runs.checkpoint_files import checkpoint_words
 from deepracer_exp.runs.checkpoints import StoredPolicy
+from deepracer_exp.runs.stored_run import StoredRun
 
 
 def laps_to_replay(

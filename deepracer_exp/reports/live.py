@@ -22,13 +22,13 @@ from deepracer_exp.evaluation.evaluate import results_table, trained_on
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.film import LapRecorder, best_attempt
 from deepracer_exp.evaluation.result import USUAL, Evaluation
-from deepracer_exp.lookup.next_steps import outcome, state
-from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.reports.page import Glimpse, Plot, plot_of, render
 from deepracer_exp.runs.checkpoint_files import checkpoint_words
 from deepracer_exp.runs.checkpoints import StoredPolicy, check, read_policy
-from deepracer_exp.runs.files import METRICS, SUMMARY, read_head, read_metrics
 from deepracer_exp.runs.folder import is_held
+from deepracer_exp.runs.next_steps import outcome, state
+from deepracer_exp.runs.run_files import METRICS, SUMMARY, read_head, read_metrics
+from deepracer_exp.runs.stored_run import StoredRun
 
 from .live_server import LiveServer
 from .sight import glimpses

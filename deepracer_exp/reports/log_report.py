@@ -35,8 +35,8 @@ from deepracer_exp.analysis.reward_replay import ReplayedRewards
 from deepracer_exp.aws.logs.recording import readable
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.files import atomic_write
-from deepracer_exp.lookup.next_steps import next_steps, official_place, outcome
-from deepracer_exp.runs.files import read_head
+from deepracer_exp.runs.next_steps import next_steps, official_place, outcome
+from deepracer_exp.runs.run_files import read_head
 
 from .page import Plot, plot_of, render
 

@@ -13,9 +13,9 @@ from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.race import RaceConfig
 from deepracer_exp.env.placement import box_corners_of, read_placements
 from deepracer_exp.env.setup import Course
-from deepracer_exp.lookup.next_steps import COMMAND, own_word
-from deepracer_exp.runs.files import BEST_LAP, LEARNING, METRICS, REPORT, TRACE, read_config
-from deepracer_exp.runs.result import FINISHED, STOPPED_EARLY
+from deepracer_exp.runs.next_steps import COMMAND, own_word
+from deepracer_exp.runs.run_files import BEST_LAP, LEARNING, METRICS, REPORT, TRACE, read_config
+from deepracer_exp.runs.run_result import FINISHED, STOPPED_EARLY
 from deepracer_exp.runs.trace import has_trace, missing_trace, read_others, read_trace
 from deepracer_exp.tracks.track import Track
 from deepracer_exp.training.result import TrainResult

@@ -23,9 +23,9 @@ from deepracer_exp.env.lidar import reach_of_rays
 from deepracer_exp.errors import RunFailed, count, writing
 from deepracer_exp.evaluation.evaluator import evaluator_against
 from deepracer_exp.evaluation.film import Lap, drive_best_lap, in_frames, write_film
-from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.checkpoint_files import checkpoint_words
-from deepracer_exp.runs.files import FILMS
+from deepracer_exp.runs.run_files import FILMS
+from deepracer_exp.runs.stored_run import StoredRun
 from deepracer_exp.sim.lidar import ANGLES_RAD, MOUNT_X_M
 from deepracer_exp.sim.scenery import box_corners
 from deepracer_exp.tracks.outline import draw_track, extent

@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import LOG_BYTES, atomic_write, open_user_file, read_json, read_json_as, read_text
 
-from .files import WRITTEN
+from .run_files import WRITTEN
 
 HASHES = "hashes.json"
 MANIFEST = "manifest.json"

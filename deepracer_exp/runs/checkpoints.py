@@ -28,7 +28,7 @@ from .checkpoint_files import (
     write_hashes,
 )
 from .components import State, check_folder, load_component, one_line
-from .files import CHECKPOINTS, REPLAY
+from .run_files import CHECKPOINTS, REPLAY
 
 logger = logging.getLogger("deepracer_exp")
 

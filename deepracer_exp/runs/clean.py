@@ -11,7 +11,9 @@ from pathlib import Path
 from deepracer_exp.errors import BadInput, RunFailed
 
 from .checkpoint_files import LINKS, checkpoint_words, kept_checkpoints, pinned, verify
-from .files import (
+from .folder import RunFolder, is_held
+from .lineage import read_lineage
+from .run_files import (
     CHECKPOINTS,
     CONFIG,
     LINEAGE,
@@ -24,9 +26,7 @@ from .files import (
     read_object,
     read_run_id,
 )
-from .folder import RunFolder, is_held
-from .lineage import read_lineage
-from .result import FAILED, FINISHED, STOPPED_EARLY
+from .run_result import FAILED, FINISHED, STOPPED_EARLY
 
 SPARE_CHECKPOINTS = "checkpoints neither best nor last"
 FAILED_TRACE = "trace of a failed run"

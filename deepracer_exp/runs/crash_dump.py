@@ -10,7 +10,7 @@ import numpy as np
 
 from deepracer_exp.files import atomic_write, read_json
 
-from .files import CRASH_DUMPS
+from .run_files import CRASH_DUMPS
 
 
 def write_crash_dump(run_dir: Path, error: BaseException, worker: int | None = None) -> None:

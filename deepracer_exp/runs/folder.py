@@ -23,7 +23,7 @@ from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.files import atomic_write
 from deepracer_exp.rewards.source import RewardSource, source_with_constants
 
-from .files import (
+from .run_files import (
     BEST_LAP,
     CONFIG,
     CRASH_DUMPS,

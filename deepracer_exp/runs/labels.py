@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import atomic_write, read_json_as
 
-from .files import LABELS
+from .run_files import LABELS
 
 _KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]{0,59}")
 _LONGEST = 2000

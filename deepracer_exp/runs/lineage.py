@@ -15,8 +15,8 @@ from deepracer_exp.env.action_space import build_action_space, describe_actions
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import read_json_as
 
-from .files import LINEAGE, REWARD, RunRecord, is_run, read_head
-from .result import RunResult, read_result
+from .run_files import LINEAGE, REWARD, RunRecord, is_run, read_head
+from .run_result import RunResult, read_result
 
 _NO_EFFECT = ("runs_dir", "debug", "report", "tracking")
 """Groups without influence on driving."""

@@ -9,7 +9,8 @@ from typing import Any
 from deepracer_exp.errors import BadInput, count
 
 from .checkpoint_files import BEST
-from .files import (
+from .labels import read_labels
+from .run_files import (
     CHECKPOINTS,
     CONFIG,
     METRICS,
@@ -21,7 +22,6 @@ from .files import (
     read_run_id,
     run_folders,
 )
-from .labels import read_labels
 
 COLUMNS = (
     "run",

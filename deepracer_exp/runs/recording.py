@@ -35,7 +35,7 @@ from deepracer_exp.env.trace import EPISODE_STATUS, SCHEMA
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import RECORD_BYTES, read_text
 
-from .files import (
+from .run_files import (
     CONFIG,
     METRICS,
     REWARD,
@@ -47,7 +47,7 @@ from .files import (
     read_config,
     read_object,
 )
-from .result import IN_TRAINING, RunResult, read_result
+from .run_result import IN_TRAINING, RunResult, read_result
 from .trace import (
     UNREADABLE,
     join_stored,

@@ -22,7 +22,7 @@ from deepracer_exp.env.trace import SCHEMA, TRACE_COLUMNS
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.files import LOG_BYTES, plain_file
 
-from .files import read_config
+from .run_files import read_config
 
 if TYPE_CHECKING:
     import pandas as pd

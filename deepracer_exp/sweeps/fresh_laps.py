@@ -12,7 +12,7 @@ from optuna.trial import FrozenTrial
 
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, TrialGroup
-from deepracer_exp.lookup.resolve import StoredRun
+from deepracer_exp.runs.stored_run import StoredRun
 
 from .queue.worker_config import WorkerConfig
 from .report.best import FreshLaps, complete_trials

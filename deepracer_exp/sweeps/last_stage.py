@@ -17,11 +17,11 @@ from optuna.trial import FrozenTrial
 
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL
-from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.reports.run_page import RunReport
 from deepracer_exp.runs.checkpoint_files import checkpoint_words
-from deepracer_exp.runs.files import is_run
-from deepracer_exp.runs.result import FAILED, INTERRUPTED
+from deepracer_exp.runs.run_files import is_run
+from deepracer_exp.runs.run_result import FAILED, INTERRUPTED
+from deepracer_exp.runs.stored_run import StoredRun
 from deepracer_exp.tracking.metadata import STUDY
 from deepracer_exp.training.budget import RunEnded
 from deepracer_exp.training.clone import plan_clone

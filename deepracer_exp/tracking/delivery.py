@@ -7,9 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from deepracer_exp.errors import BadInput, RunFailed
-from deepracer_exp.runs.files import SUMMARY, TRACKING, read_object, read_run_id
 from deepracer_exp.runs.labels import USER_TAG, Labels
-from deepracer_exp.runs.result import FAILED, FINISHED, STOPPED_EARLY
+from deepracer_exp.runs.run_files import SUMMARY, TRACKING, read_object, read_run_id
+from deepracer_exp.runs.run_result import FAILED, FINISHED, STOPPED_EARLY
 
 from .calls import StoreRefusedError, StoreUnavailableError
 from .metadata import NAME, USER_NOTE, label_tags

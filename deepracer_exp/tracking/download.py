@@ -19,7 +19,7 @@ from deepracer_exp.files import read_json
 from deepracer_exp.lifeline import running
 from deepracer_exp.patience import communicate
 from deepracer_exp.runs.checkpoint_files import HASHES, checkpoint_sha256, verify
-from deepracer_exp.runs.files import (
+from deepracer_exp.runs.run_files import (
     CHECKPOINTS,
     CONFIG,
     METRICS,

@@ -12,7 +12,7 @@ from typing import Any
 from typing_extensions import override
 
 from deepracer_exp.config.running import WandbTracking
-from deepracer_exp.runs.files import TENSORBOARD, WANDB
+from deepracer_exp.runs.run_files import TENSORBOARD, WANDB
 
 from .metrics import recordable_values
 from .projection import RunProjection, files_to_keep

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from deepracer_exp.config.overrides import key_of
-from deepracer_exp.runs.files import BEST_LAP, REPORT, who_and_where
 from deepracer_exp.runs.labels import Labels
 from deepracer_exp.runs.lineage import Lineage
-from deepracer_exp.runs.result import of_conditions
+from deepracer_exp.runs.run_files import BEST_LAP, REPORT, who_and_where
+from deepracer_exp.runs.run_result import of_conditions
 
 from .metrics import BEST, METRICS, TRACK_METRICS, best_metrics, metric_name, trial_metric
 

@@ -10,7 +10,8 @@ from typing_extensions import override
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.checkpoint_files import LINKS, restore_links
-from deepracer_exp.runs.files import (
+from deepracer_exp.runs.labels import read_labels
+from deepracer_exp.runs.run_files import (
     BEST_LAP,
     CHECKPOINTS,
     CONFIG,
@@ -28,7 +29,6 @@ from deepracer_exp.runs.files import (
     read_metrics,
     read_object,
 )
-from deepracer_exp.runs.labels import read_labels
 
 from .calls import StoreRefusedError, StoreUnavailableError
 from .metadata import END_TAG, KIND, NOTE, STUDY, label_tags

@@ -16,7 +16,7 @@ from deepracer_exp.addresses import taken_out
 from deepracer_exp.config.running import TensorBoardTracking, WandbTracking
 from deepracer_exp.lifeline import running
 from deepracer_exp.patience import wait_patiently
-from deepracer_exp.runs.files import METRICS
+from deepracer_exp.runs.run_files import METRICS
 
 from .store import Store
 from .tracking_file import Recorded, TrackedRun, read_recorded, write_tracked_run

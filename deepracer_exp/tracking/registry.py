@@ -16,7 +16,7 @@ from deepracer_exp.config.experiment import safe_name
 from deepracer_exp.errors import BadInput, nearest
 from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, find_checkpoint, pin, verify
 from deepracer_exp.runs.clean import StoreOverview
-from deepracer_exp.runs.files import (
+from deepracer_exp.runs.run_files import (
     BEST_LAP,
     CHECKPOINTS,
     METRICS,

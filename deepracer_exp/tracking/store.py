@@ -18,7 +18,7 @@ from filelock import FileLock
 
 from deepracer_exp.addresses import with_password, without_passwords
 from deepracer_exp.errors import BadInput, nearest
-from deepracer_exp.runs.files import MLFLOW_DB
+from deepracer_exp.runs.run_files import MLFLOW_DB
 
 from . import calls
 from .calls import (

@@ -11,7 +11,7 @@ from typing_extensions import override
 from deepracer_exp.config.own_class import OwnClass, build_own
 from deepracer_exp.config.running import MLflowTracking, TrackingConfig, TrackingOff, WandbTracking
 from deepracer_exp.errors import BadInput
-from deepracer_exp.runs.files import TENSORBOARD, WANDB
+from deepracer_exp.runs.run_files import TENSORBOARD, WANDB
 
 from .metadata import END_TAG
 from .metrics import now_ms

@@ -10,7 +10,7 @@ from pydantic import TypeAdapter
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import atomic_write, read_json_as
-from deepracer_exp.runs.files import MLFLOW, TRACKING
+from deepracer_exp.runs.run_files import MLFLOW, TRACKING
 
 Status = Literal["FINISHED", "FAILED", "KILLED"]
 

@@ -12,10 +12,10 @@ from deepracer_exp.config.overrides import group_of
 from deepracer_exp.config.running import BudgetConfig
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.lifeline import given_environment, running
-from deepracer_exp.lookup.next_steps import command_line, run_word
 from deepracer_exp.patience import communicate, ends, wait_patiently
-from deepracer_exp.runs.files import SUMMARY, read_config, read_object
-from deepracer_exp.runs.result import FAILED, INTERRUPTED, Ending
+from deepracer_exp.runs.next_steps import command_line, run_word
+from deepracer_exp.runs.run_files import SUMMARY, read_config, read_object
+from deepracer_exp.runs.run_result import FAILED, INTERRUPTED, Ending
 
 _log = logging.getLogger(__name__)
 

@@ -11,8 +11,8 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.lookup.resolve import StoredRun
-from deepracer_exp.runs.result import Ending
+from deepracer_exp.runs.run_result import Ending
+from deepracer_exp.runs.stored_run import StoredRun
 from deepracer_exp.tracking.delivery import ENDS
 from deepracer_exp.tracking.metadata import END_TAG, joined
 from deepracer_exp.tracking.metrics import now_ms

@@ -9,9 +9,9 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.overrides import group_of, key_of
 from deepracer_exp.config.parse import import_own_classes, parse_experiment
 from deepracer_exp.config.stored import with_overrides
-from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, checkpoint_words, pin
-from deepracer_exp.runs.files import (
+from deepracer_exp.runs.lineage import Lineage, read_lineage, refuse_other_networks
+from deepracer_exp.runs.run_files import (
     CHECKPOINTS,
     PROVENANCE,
     REWARD,
@@ -20,7 +20,7 @@ from deepracer_exp.runs.files import (
     read_object,
     read_run_id,
 )
-from deepracer_exp.runs.lineage import Lineage, read_lineage, refuse_other_networks
+from deepracer_exp.runs.stored_run import StoredRun
 
 from .plan import TrainPlan, plan_training
 

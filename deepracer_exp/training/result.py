@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from deepracer_exp.runs.result import Ending
+from deepracer_exp.runs.run_result import Ending
 
 
 class TakenOver(Exception):  # noqa: N818 - reads as what it is at the raise site

@@ -10,7 +10,7 @@ import torch
 from deepracer_exp.config.race import NEWEST, RivalsConfig
 from deepracer_exp.env.head_to_head import Rivals, Weights, rival_setup, weights_of
 from deepracer_exp.env.setup import RaceSetup
-from deepracer_exp.lookup.resolve import StoredRun
+from deepracer_exp.runs.stored_run import StoredRun
 
 _STATE = "rivals"
 """Key of the snapshots in a checkpoint."""

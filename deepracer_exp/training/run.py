@@ -26,12 +26,14 @@ from deepracer_exp.config.parse import parse_config
 from deepracer_exp.config.running import BudgetConfig
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.errors import NO_MEMORY, BadInput, RunFailed, count, is_refused_memory, reading
-from deepracer_exp.lookup.next_steps import schedule_until
-from deepracer_exp.lookup.resolve import StoredRun
-from deepracer_exp.lookup.rival import keep_rival, kept_rival
+from deepracer_exp.evaluation.rival_run import keep_rival, kept_rival
 from deepracer_exp.rewards.reward import RewardFunction
 from deepracer_exp.runs.checkpoints import check, checkpoint_name, intact_checkpoint, read_training
-from deepracer_exp.runs.files import (
+from deepracer_exp.runs.fingerprint import refuse_changes
+from deepracer_exp.runs.folder import RunFolder
+from deepracer_exp.runs.lineage import Lineage, read_lineage
+from deepracer_exp.runs.next_steps import schedule_until
+from deepracer_exp.runs.run_files import (
     CHECKPOINTS,
     CONFIG,
     LINEAGE,
@@ -41,10 +43,8 @@ from deepracer_exp.runs.files import (
     TRACKING,
     read_object,
 )
-from deepracer_exp.runs.fingerprint import refuse_changes
-from deepracer_exp.runs.folder import RunFolder
-from deepracer_exp.runs.lineage import Lineage, read_lineage
-from deepracer_exp.runs.result import FINISHED, INTERRUPTED, Ending
+from deepracer_exp.runs.run_result import FINISHED, INTERRUPTED, Ending
+from deepracer_exp.runs.stored_run import StoredRun
 from deepracer_exp.scratch import folder_aside
 from deepracer_exp.sim.batch import CarBatch
 from deepracer_exp.tracking.metadata import joined, lineage_tags, run_params, run_tags

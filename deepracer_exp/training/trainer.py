@@ -26,13 +26,13 @@ from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.env.trace import PACKED, to_table
 from deepracer_exp.errors import RunFailed, reading
 from deepracer_exp.evaluation.result import Evaluation
-from deepracer_exp.lookup.rival import kept_rival
+from deepracer_exp.evaluation.rival_run import kept_rival
 from deepracer_exp.runs.checkpoints import CheckpointStore, read_agent
 from deepracer_exp.runs.crash_dump import write_crash_dump
-from deepracer_exp.runs.files import SUMMARY, TRACE
 from deepracer_exp.runs.fingerprint import fingerprint
 from deepracer_exp.runs.folder import RunFolder
-from deepracer_exp.runs.result import FAILED, FINISHED, INTERRUPTED, Ending, fastest_reliable
+from deepracer_exp.runs.run_files import SUMMARY, TRACE
+from deepracer_exp.runs.run_result import FAILED, FINISHED, INTERRUPTED, Ending, fastest_reliable
 from deepracer_exp.runs.trace import trace_writer
 from deepracer_exp.sim.batch import cores
 

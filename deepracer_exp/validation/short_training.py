@@ -7,7 +7,7 @@ import numpy as np
 from rich.console import Console
 
 from deepracer_exp.errors import RunFailed
-from deepracer_exp.runs.files import METRICS, read_metrics
+from deepracer_exp.runs.run_files import METRICS, read_metrics
 from deepracer_exp.training.plan import TrainPlan
 
 _FEWEST = 6

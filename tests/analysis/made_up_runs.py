@@ -8,7 +8,7 @@ import numpy as np
 import yaml
 
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.runs.files import RunRecord, read_record
+from deepracer_exp.runs.run_files import RunRecord, read_record
 
 
 def made_up_run(

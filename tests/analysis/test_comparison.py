@@ -6,8 +6,8 @@ import pytest
 
 from deepracer_exp.analysis.comparison import NOTHING, last_value, results, value_text
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.runs.files import RunRecord
 from deepracer_exp.runs.lineage import run_differences
+from deepracer_exp.runs.run_files import RunRecord
 
 
 def row(iteration: int, lap_s: float | None = None, **more: object) -> dict:

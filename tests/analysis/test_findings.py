@@ -20,7 +20,7 @@ from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.reports.log_report import LogPage, draw_sections, html
 from deepracer_exp.runs.recording import EVALUATION_COLUMNS, RunRecording
-from deepracer_exp.runs.result import RunResult
+from deepracer_exp.runs.run_result import RunResult
 from deepracer_exp.tracks.sectors import sectors_of
 from deepracer_exp.training.stopping.judge import LOG_RULE
 

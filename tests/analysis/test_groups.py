@@ -12,7 +12,7 @@ from deepracer_exp.analysis.evidence import SAME, TOO_FEW, estimate
 from deepracer_exp.analysis.group_curves import curves_table, group_curve
 from deepracer_exp.analysis.group_tables import differences_table, groups_as_json, scored, sentences
 from deepracer_exp.analysis.groups import RunGroup, compared, group_runs
-from deepracer_exp.runs.files import RunRecord, read_record
+from deepracer_exp.runs.run_files import RunRecord, read_record
 
 from .chart_layers import drawn, layers
 from .made_up_runs import made_up_run, made_up_seeds

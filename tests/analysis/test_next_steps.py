@@ -6,9 +6,9 @@ import shutil
 import pytest
 import yaml
 
-from deepracer_exp.lookup.next_steps import next_steps, own_word, run_word
-from deepracer_exp.lookup.resolve import resolve
-from deepracer_exp.runs.files import read_object
+from deepracer_exp.runs.next_steps import next_steps, own_word, run_word
+from deepracer_exp.runs.run_files import read_object
+from deepracer_exp.tracking.resolve import resolve
 
 
 @pytest.fixture

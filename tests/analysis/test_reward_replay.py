@@ -16,8 +16,8 @@ from deepracer_exp.env.trace import SCHEMA
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.source import named_reward_source
 from deepracer_exp.runs import trace
-from deepracer_exp.runs.files import read_config
 from deepracer_exp.runs.recording import read_run_recording
+from deepracer_exp.runs.run_files import read_config
 from deepracer_exp.tracks.track import Track
 from tests.conftest import IN_PROCESS, call_in
 

@@ -170,7 +170,7 @@ def test_bad_input_is_one_line(run_dir, call, tmp_path, arguments, words):
 def test_a_training_ends_with_its_page_which_stands_in_its_mlflow_run_too(call):
     from mlflow import MlflowClient
 
-    from deepracer_exp.runs.files import read_run_id
+    from deepracer_exp.runs.run_files import read_run_id
 
     tiny = ("experiment=tiny", "collector=in_process", "collector.threads=1", "budget.iterations=1")
     ended = call("train", *tiny, "report=true")

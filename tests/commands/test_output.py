@@ -12,7 +12,7 @@ from rich.tree import Tree
 import deepracer_exp
 from deepracer_exp.commands.output import plain_console, print_result, print_steps, print_unsent
 from deepracer_exp.config.running import MLflowTracking
-from deepracer_exp.runs.result import Ending
+from deepracer_exp.runs.run_result import Ending
 from deepracer_exp.training.result import TrainResult
 
 

@@ -15,8 +15,8 @@ from deepracer_exp.config.stored import request_evaluation
 from deepracer_exp.evaluation.evaluate import results_table
 from deepracer_exp.evaluation.plan import plan_evaluation
 from deepracer_exp.evaluation.result import Evaluation
-from deepracer_exp.lookup.resolve import resolve
 from deepracer_exp.runs.checkpoints import read_checkpoint
+from deepracer_exp.tracking.resolve import resolve
 from tests.conftest import refused
 
 from .test_result import attempt, group

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from imageio_ffmpeg import read_frames
 
-from deepracer_exp.runs.files import read_config
+from deepracer_exp.runs.run_files import read_config
 
 AHEAD = (
     *("race=object_avoidance", "race.boxes.placement=fixed", "observation.next_objects=1"),

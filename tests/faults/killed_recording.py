@@ -14,7 +14,7 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 
-from deepracer_exp.runs.files import read_metrics
+from deepracer_exp.runs.run_files import read_metrics
 from deepracer_exp.tracking import projection, projector
 from deepracer_exp.tracking.metrics import now_ms
 from deepracer_exp.tracking.mlflow_run import MLflowRun

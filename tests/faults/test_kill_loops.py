@@ -16,7 +16,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from deepracer_exp.runs.files import read_metrics, read_object
+from deepracer_exp.runs.run_files import read_metrics, read_object
 from tests.waiting import PATIENCE_S
 
 from .test_killed_sweeps import Sweep, assert_every_trial_is_accounted_for_once, claims

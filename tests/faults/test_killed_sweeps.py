@@ -15,7 +15,7 @@ import optuna
 import psutil
 import pytest
 
-from deepracer_exp.runs.files import read_metrics, read_object
+from deepracer_exp.runs.run_files import read_metrics, read_object
 from deepracer_exp.sweeps.queue.claims import TrialClaims
 from deepracer_exp.sweeps.queue.storage import open_storage
 from deepracer_exp.sweeps.trial import Trial

@@ -24,7 +24,7 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.reports.log_report import SECTIONS, LogPage, write_log_page
 from deepracer_exp.reports.log_report import html as page_html
 from deepracer_exp.runs.recording import RunRecording
-from deepracer_exp.runs.result import RunResult
+from deepracer_exp.runs.run_result import RunResult
 from tests.analysis.made_up import Drive, made_up_recording
 from tests.browser import needs_chromium
 from tests.page_html import Html

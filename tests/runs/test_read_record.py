@@ -4,7 +4,7 @@ import pytest
 
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.errors import BadInput
-from deepracer_exp.runs.files import read_record
+from deepracer_exp.runs.run_files import read_record
 
 
 @pytest.mark.parametrize(

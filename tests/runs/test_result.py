@@ -4,7 +4,7 @@ from dataclasses import asdict
 
 import pytest
 
-from deepracer_exp.runs.result import Ending, fastest_reliable, result_of, why_not_fastest
+from deepracer_exp.runs.run_result import Ending, fastest_reliable, result_of, why_not_fastest
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,8 @@ import pytest
 
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.errors import BadInput
-from deepracer_exp.lookup.best import best_run_of_sweep, read_best_of_sweep
-from deepracer_exp.lookup.resolve import resolve
-from deepracer_exp.runs.files import BEST_OF_SWEEP
+from deepracer_exp.runs.best_run import best_run_of_sweep, read_best_of_sweep
+from deepracer_exp.runs.run_files import BEST_OF_SWEEP
 from deepracer_exp.sweeps.report.best import (
     best_line,
     best_run,
@@ -18,6 +17,7 @@ from deepracer_exp.sweeps.report.best import (
     write_best,
 )
 from deepracer_exp.sweeps.trial import SeedRun
+from deepracer_exp.tracking.resolve import resolve
 from tests.conftest import refused
 
 from .studies import add, fresh_laps, new_study, write_metrics

@@ -1,6 +1,6 @@
 """What a study says of its last race: which policy to submit, and why."""
 
-from deepracer_exp.lookup.best import read_best_of_sweep
+from deepracer_exp.runs.best_run import read_best_of_sweep
 from deepracer_exp.sweeps.report.last_race import LastRace, Racer, last_race, store_last_race, write_submitted
 from deepracer_exp.sweeps.report.page import export_step, study_page, study_summary
 from tests.page_html import Html

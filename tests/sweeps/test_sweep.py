@@ -13,7 +13,7 @@ from deepracer_exp.config.sweep import compose_sweep
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.evaluation.race_protocol import Attempt
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, TrialGroup
-from deepracer_exp.runs.files import read_object
+from deepracer_exp.runs.run_files import read_object
 from deepracer_exp.sweeps.fresh_laps import interval_of
 from deepracer_exp.sweeps.queue.claims import Claim
 from deepracer_exp.sweeps.queue.driver import Driver

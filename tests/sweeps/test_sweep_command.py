@@ -8,7 +8,7 @@ import yaml
 from optuna.trial import TrialState
 
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.runs.files import read_config, read_object
+from deepracer_exp.runs.run_files import read_config, read_object
 from deepracer_exp.sweeps.queue.storage import open_storage
 from deepracer_exp.sweeps.report.best import best_line, best_run
 from deepracer_exp.sweeps.trial import Trial

@@ -19,7 +19,7 @@ from deepracer_exp.runs.clean import (
     replays,
     survey,
 )
-from deepracer_exp.runs.files import full_name
+from deepracer_exp.runs.run_files import full_name
 from deepracer_exp.tracking.registry import read_overview
 
 HOUR_S = 3600

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from deepracer_exp.errors import BadInput, RunFailed
-from deepracer_exp.runs.files import read_run_id
+from deepracer_exp.runs.run_files import read_run_id
 from deepracer_exp.tracking.calls import StoreRefusedError
 from deepracer_exp.tracking.delivery import deliver, deliver_evaluation, is_delivered
 from deepracer_exp.tracking.mlflow_run import MLflowRun

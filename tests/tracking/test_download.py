@@ -14,12 +14,12 @@ from types import SimpleNamespace
 import pytest
 
 from deepracer_exp.errors import BadInput
-from deepracer_exp.lookup.resolve import resolve
 from deepracer_exp.runs.checkpoint_files import verify
 from deepracer_exp.tracking import download as module
 from deepracer_exp.tracking.calls import StoreRefusedError
 from deepracer_exp.tracking.download import Download, download
 from deepracer_exp.tracking.registry import look_up
+from deepracer_exp.tracking.resolve import resolve
 from deepracer_exp.tracking.store import Store, resolve_store
 from tests.conftest import refused
 
@@ -168,7 +168,7 @@ def test_a_name_from_the_registry_becomes_no_path_out_of_runs_dir(away, season, 
     found = look_up("champion", None, season.runs_dir)
     for run_dir in ("/x/../..", "/x/.ssh/run", "/x/season/a b"):
         odd = replace(found, run_dir=Path(run_dir))
-        monkeypatch.setattr("deepracer_exp.lookup.resolve.look_up", lambda *_, odd=odd: odd)
+        monkeypatch.setattr("deepracer_exp.tracking.resolve.look_up", lambda *_, odd=odd: odd)
         assert "is not the name of a run" in refused(resolve, "champion", season.runs_dir, None)
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from deepracer_exp.config.running import WandbTracking
-from deepracer_exp.runs.files import TENSORBOARD, WANDB
+from deepracer_exp.runs.run_files import TENSORBOARD, WANDB
 from deepracer_exp.tracking.delivery import undelivered
 from deepracer_exp.tracking.loggers import TensorBoardProjection, WandbProjection
 from deepracer_exp.tracking.metrics import METRICS, metric_name

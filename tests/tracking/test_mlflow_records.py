@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from mlflow import MlflowClient
 
-from deepracer_exp.runs.files import read_run_id
+from deepracer_exp.runs.run_files import read_run_id
 from deepracer_exp.tracking import projector
 from deepracer_exp.tracking.metadata import param_text
 from deepracer_exp.tracking.metrics import metric_name, now_ms

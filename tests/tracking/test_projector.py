@@ -10,7 +10,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from deepracer_exp.runs.files import read_run_id
+from deepracer_exp.runs.run_files import read_run_id
 from deepracer_exp.tracking import projector
 from deepracer_exp.tracking.metrics import now_ms
 from deepracer_exp.tracking.projector import Projector

@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 
-from deepracer_exp.lookup.resolve import resolve
+from deepracer_exp.tracking.resolve import resolve
 from deepracer_exp.tracking.store import is_run_id
 from tests.conftest import refused
 

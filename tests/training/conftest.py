@@ -7,7 +7,7 @@ import torch
 
 from benchmarks.same import different_rows, different_tensors, different_traces
 from deepracer_exp.collectors.forking import start_workers_early
-from deepracer_exp.runs.files import read_metrics, read_object
+from deepracer_exp.runs.run_files import read_metrics, read_object
 
 # As a training does: on a busy machine threads of torch wait for one another, and saving a small network took 20 s.
 torch.set_num_threads(1)

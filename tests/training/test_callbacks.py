@@ -5,10 +5,10 @@ import json
 import pytest
 
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.lookup.resolve import StoredRun
-from deepracer_exp.runs.files import read_metrics, read_run_id
 from deepracer_exp.runs.folder import RunFolder, is_held
-from deepracer_exp.runs.result import STOPPED_EARLY, fastest_reliable
+from deepracer_exp.runs.run_files import read_metrics, read_run_id
+from deepracer_exp.runs.run_result import STOPPED_EARLY, fastest_reliable
+from deepracer_exp.runs.stored_run import StoredRun
 from deepracer_exp.training.plan import plan_resume, plan_training
 from deepracer_exp.training.result import TakenOver
 from deepracer_exp.training.run import copy_run, run_training

@@ -10,10 +10,10 @@ import yaml
 from mlflow import MlflowClient
 from torchrl.checkpoint import Checkpoint
 
-from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pinned
 from deepracer_exp.runs.checkpoints import State
-from deepracer_exp.runs.files import read_config, read_object
+from deepracer_exp.runs.run_files import read_config, read_object
+from deepracer_exp.runs.stored_run import StoredRun
 from deepracer_exp.training.clone import plan_clone
 
 OFTEN = ("episode.max_steps=60", "checkpoints.every=2", "budget.env_steps=null", "budget.iterations=3")

@@ -25,8 +25,8 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.errors import BadInput
-from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.runs.checkpoints import read_checkpoint
+from deepracer_exp.runs.stored_run import StoredRun
 from tests.conftest import IN_PROCESS
 
 NAME = "11_Step-38428.ckpt"

@@ -12,10 +12,10 @@ from mlflow import MlflowClient
 
 from deepracer_exp.agents.ppo import PPO
 from deepracer_exp.errors import RunFailed
-from deepracer_exp.lookup.resolve import resolve
 from deepracer_exp.runs.checkpoints import check, checkpoint_name, read_checkpoint, read_training
-from deepracer_exp.runs.files import read_metrics, read_object
 from deepracer_exp.runs.folder import RunFolder
+from deepracer_exp.runs.run_files import read_metrics, read_object
+from deepracer_exp.tracking.resolve import resolve
 from deepracer_exp.training import signals
 from deepracer_exp.training.trainer import Trainer
 from tests.conftest import IN_PROCESS

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from deepracer_exp.runs.checkpoints import check, read_training
-from deepracer_exp.runs.files import read_metrics
+from deepracer_exp.runs.run_files import read_metrics
 from tests.conftest import IN_WORKERS
 
 from .conftest import assert_same_run
@@ -89,7 +89,7 @@ def test_a_clone_begins_its_pool_with_its_parent_s_policy(copied, call, tmp_path
     assert ended.code == 0, ended.stderr
     (child,) = (tmp_path / "runs" / "child").glob("*/config.yaml")
     pool = read_training(check(child.parent / "checkpoints" / "last"))["rivals"]
-    from deepracer_exp.lookup.resolve import StoredRun
+    from deepracer_exp.runs.stored_run import StoredRun
 
     policy = StoredRun(parent).with_policy().read_policy().networks.policy
     for name, tensor in policy.state_dict().items():

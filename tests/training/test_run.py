@@ -10,8 +10,8 @@ from benchmarks.same import different_rows, different_tensors, different_traces
 from deepracer_exp.agents.ppo import PPO
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.observation import Features
-from deepracer_exp.runs.files import read_metrics
-from deepracer_exp.runs.result import Ending
+from deepracer_exp.runs.run_files import read_metrics
+from deepracer_exp.runs.run_result import Ending
 from deepracer_exp.runs.trace import read_trace
 from deepracer_exp.training.plan import plan_training
 from deepracer_exp.training.run import run_training

@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
-from deepracer_exp.runs.files import read_config, read_metrics, read_object
+from deepracer_exp.runs.run_files import read_config, read_metrics, read_object
 from tests.conftest import IN_PROCESS
 
 from .conftest import assert_same_run

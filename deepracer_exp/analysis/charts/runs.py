@@ -13,8 +13,8 @@ from deepracer_exp.analysis.log_view import LogView
 from deepracer_exp.analysis.statistics import Values, moving_average
 from deepracer_exp.aws.logs.recording import TRAINING
 from deepracer_exp.files import read_json
-from deepracer_exp.runs.files import EVALUATIONS, METRICS
 from deepracer_exp.runs.lineage import clone_chain
+from deepracer_exp.runs.run_files import EVALUATIONS, METRICS
 
 from .figure import Chart, Layer, Panel, band, heatmap, in_rows, line, mark, note, points
 from .style import BLUE, CATEGORIES, FAINT, INK, ORANGE

@@ -10,9 +10,9 @@ from deepracer_exp.config.dimension import Choice
 from deepracer_exp.config.options import groups
 from deepracer_exp.config.sweep import SweepRequest
 from deepracer_exp.errors import BadInput
-from deepracer_exp.lookup.resolve import resolve
-from deepracer_exp.runs.files import read_config
+from deepracer_exp.runs.run_files import read_config
 from deepracer_exp.sweeps.search.space import SearchSpace, value_at
+from deepracer_exp.tracking.resolve import resolve
 
 
 def known_settings(request: SweepRequest, space: SearchSpace) -> list[dict[str, Choice]]:

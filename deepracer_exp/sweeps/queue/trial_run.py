@@ -17,10 +17,10 @@ from deepracer_exp.errors import RunFailed
 from deepracer_exp.evaluation.evaluate import write_evaluation
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL
-from deepracer_exp.lookup.resolve import StoredRun
 from deepracer_exp.reports.run_page import RunReport
 from deepracer_exp.runs.checkpoint_files import kept_checkpoints
-from deepracer_exp.runs.files import (
+from deepracer_exp.runs.folder import is_held
+from deepracer_exp.runs.run_files import (
     CHECKPOINTS,
     METRICS,
     SUMMARY,
@@ -29,8 +29,8 @@ from deepracer_exp.runs.files import (
     read_object,
     read_run_id,
 )
-from deepracer_exp.runs.folder import is_held
-from deepracer_exp.runs.result import FAILED, FINISHED, INTERRUPTED, STOPPED_EARLY, Ending
+from deepracer_exp.runs.run_result import FAILED, FINISHED, INTERRUPTED, STOPPED_EARLY, Ending
+from deepracer_exp.runs.stored_run import StoredRun
 from deepracer_exp.sweeps.search.objectives import intermediate_value, objective_values
 from deepracer_exp.sweeps.search.pruners import FirstOf, PruneDecision
 from deepracer_exp.sweeps.trial import Interrupted, SeedRun, Trial, runs_as_json

@@ -14,8 +14,9 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.sweep import SweepConfig
 from deepracer_exp.errors import BadInput
-from deepracer_exp.lookup.resolve import StoredRun, resolve
+from deepracer_exp.runs.stored_run import StoredRun
 from deepracer_exp.sweeps.search.space import SearchSpace
+from deepracer_exp.tracking.resolve import resolve
 from deepracer_exp.tracking.store import Store
 from deepracer_exp.training.clone import plan_clone, read_parent
 from deepracer_exp.training.plan import TrainPlan, plan_training

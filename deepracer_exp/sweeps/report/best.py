@@ -11,9 +11,9 @@ from optuna.trial import FrozenTrial, TrialState
 
 from deepracer_exp.analysis.evidence import Values, difference, estimate
 from deepracer_exp.errors import BadInput
-from deepracer_exp.lookup.best import BestOfSweep, write_best_of_sweep
-from deepracer_exp.runs.files import is_run
-from deepracer_exp.runs.result import FRESH_LAPS, SWEEP_LAPS
+from deepracer_exp.runs.best_run import BestOfSweep, write_best_of_sweep
+from deepracer_exp.runs.run_files import is_run
+from deepracer_exp.runs.run_result import FRESH_LAPS, SWEEP_LAPS
 from deepracer_exp.sweeps.search.objectives import MEASURES, NONE, cost, objectives_of, shown, shown_values
 from deepracer_exp.sweeps.trial import SeedRun, Trial
 

@@ -7,8 +7,8 @@ import optuna
 
 from deepracer_exp.config.sweep import SweepConfig
 from deepracer_exp.errors import count
-from deepracer_exp.lookup.best import BestOfSweep, write_best_of_sweep
-from deepracer_exp.runs.result import BOTH, of_conditions
+from deepracer_exp.runs.best_run import BestOfSweep, write_best_of_sweep
+from deepracer_exp.runs.run_result import BOTH, of_conditions
 from deepracer_exp.sweeps.search.objectives import shown, shown_or_dash
 
 from .best import complete_trials

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import optuna
 
 from deepracer_exp.errors import BadInput
-from deepracer_exp.runs.result import of_conditions, with_unit
+from deepracer_exp.runs.run_result import of_conditions, with_unit
 
 if TYPE_CHECKING:
     from deepracer_exp.evaluation.result import Evaluation

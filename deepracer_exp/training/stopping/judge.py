@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import TypeAdapter, ValidationError
 
 from deepracer_exp.config.stopping import ConvergedRule, EntropyStopping, OverfittingRule, StoppingConfig
-from deepracer_exp.runs.result import RELIABLE
+from deepracer_exp.runs.run_result import RELIABLE
 
 from .stopping_rules import Decision, Row, TrendRule
 

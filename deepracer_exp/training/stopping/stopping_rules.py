@@ -18,7 +18,7 @@ from deepracer_exp.config.stopping import (
     StoppingConfig,
 )
 from deepracer_exp.errors import count
-from deepracer_exp.runs.result import FINISHED, STOPPED_EARLY, Ending, reliable_lap_s
+from deepracer_exp.runs.run_result import FINISHED, STOPPED_EARLY, Ending, reliable_lap_s
 
 from . import trends
 from .trends import Average, Reason

@@ -9,8 +9,11 @@ from typing import Any
 
 from deepracer_exp.config.own_class import GROUPS, OF_POLICY, named_again
 from deepracer_exp.errors import BadInput
-from deepracer_exp.lookup.best import best_of
-from deepracer_exp.runs.files import (
+from deepracer_exp.tracks.boards import standings, what_it_sees
+
+from .best_run import best_of
+from .folder import is_held
+from .run_files import (
     BEST,
     CHECKPOINTS,
     LINEAGE,
@@ -22,17 +25,7 @@ from deepracer_exp.runs.files import (
     read_metrics,
     sees_pictures,
 )
-from deepracer_exp.runs.folder import is_held
-from deepracer_exp.runs.result import (
-    FAILED,
-    FIGURES,
-    INTERRUPTED,
-    Ending,
-    fastest_reliable,
-    read_result,
-    why_not_fastest,
-)
-from deepracer_exp.tracks.boards import standings, what_it_sees
+from .run_result import FAILED, FIGURES, INTERRUPTED, Ending, fastest_reliable, read_result, why_not_fastest
 
 COMMAND = "deepracer-exp"
 SECOND_PHASE = "randomization=sim2real budget.env_steps=1000000"

@@ -8,7 +8,7 @@ from typing import Any, Self
 
 from deepracer_exp.errors import BadInput
 
-from .files import SUMMARY, read_object
+from .run_files import SUMMARY, read_object
 
 FINISHED, STOPPED_EARLY, INTERRUPTED, FAILED = "finished", "stopped early", "interrupted", "failed"
 """`status` of a run that has ended, as in summary.json."""

@@ -11,16 +11,9 @@ from pydantic import Field, TypeAdapter
 from deepracer_exp.config.experiment import safe_name
 from deepracer_exp.errors import BadInput, nearest
 from deepracer_exp.files import atomic_write, read_json_as
-from deepracer_exp.runs.files import (
-    BEST,
-    BEST_OF_SWEEP,
-    CHECKPOINTS,
-    CONFIG,
-    is_run,
-    read_config,
-    run_folders,
-)
-from deepracer_exp.runs.result import RunResult, read_result
+
+from .run_files import BEST, BEST_OF_SWEEP, CHECKPOINTS, CONFIG, is_run, read_config, run_folders
+from .run_result import RunResult, read_result
 
 
 def best_of(experiment: str, runs_dir: Path) -> Path:

@@ -6,9 +6,9 @@ from pathlib import Path
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.action_space import build_action_space, describe_actions
 from deepracer_exp.errors import BadInput
-from deepracer_exp.runs.files import CHECKPOINTS, CONFIG, RIVAL
-
-from .resolve import StoredRun, resolve
+from deepracer_exp.runs.run_files import CHECKPOINTS, CONFIG, RIVAL
+from deepracer_exp.runs.stored_run import StoredRun
+from deepracer_exp.tracking.resolve import resolve
 
 
 def find_rival(
