@@ -43,6 +43,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from deepracer_exp.aws.export.car_converter import NEEDED, Conversion, compare_in_openvino, has_openvino
+from deepracer_exp.aws.export.car_export import car_archive
+from deepracer_exp.aws.export.onnx import DeployedPolicy
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.env.action_space import build_action_space
@@ -50,9 +53,6 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.evaluate import CAR, SIMULATOR, car_protocols
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.result import NOTHING, USUAL
-from deepracer_exp.export.car_archive import car_archive
-from deepracer_exp.export.car_converter import NEEDED, Conversion, compare_in_openvino, has_openvino
-from deepracer_exp.export.onnx import DeployedPolicy
 from deepracer_exp.runs.stored_run import StoredRun
 
 from .camera import read_frames

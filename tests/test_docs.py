@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 import yaml
 
+from deepracer_exp.aws.validation.pitfalls import lap_returns, slow_laps_return_as_much
+from deepracer_exp.aws.validation.simple_driver import action_space_laps
+from deepracer_exp.aws.validation.validate import read
 from deepracer_exp.cli import parse
 from deepracer_exp.commands.arguments import runs_and_overrides
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment, expand_grid
 from deepracer_exp.config.options import conf_dir, groups, options
 from deepracer_exp.config.sweep import compose_sweep
-from deepracer_exp.validation.laps import action_space_laps
-from deepracer_exp.validation.pitfalls import lap_returns, slow_laps_return_as_much
-from deepracer_exp.validation.validate import read
 from tests.test_own_classes import write_examples
 
 ROOT = Path(__file__).parents[1]

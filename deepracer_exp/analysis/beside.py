@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from deepracer_exp.aws.logs.recording import TRAINING
+from deepracer_exp.aws.logs.recorded import TRAINING
 from deepracer_exp.errors import count
 
 from .log_view import LogView

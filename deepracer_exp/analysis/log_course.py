@@ -9,7 +9,7 @@ import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
-from deepracer_exp.aws.logs.recording import LogProblem, Recording
+from deepracer_exp.aws.logs.recorded import LogProblem, Recording
 from deepracer_exp.aws.logs.sim_trace import EARLIEST_CLOCK_S
 from deepracer_exp.aws.worlds.catalogue import find_world, worlds
 from deepracer_exp.aws.worlds.routes import NEAR_M, recognise, world_rows

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from deepracer_exp.aws.logs.recording import TRAINING, LogProblem, Recording
+from deepracer_exp.aws.logs.recorded import TRAINING, LogProblem, Recording
 from deepracer_exp.aws.models.hyperparameters import Hyperparameters
 from deepracer_exp.env.placement import PlacedOthers, box_corners_of, rebuild_poses
 from deepracer_exp.errors import BadInput

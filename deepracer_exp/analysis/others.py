@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from deepracer_exp.aws.logs.recording import Recording
+from deepracer_exp.aws.logs.recorded import Recording
 from deepracer_exp.config.job_race import recorded_race
 from deepracer_exp.env.placement import (
     PlacedOthers,

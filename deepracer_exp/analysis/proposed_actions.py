@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.cluster.vq import kmeans2
 from scipy.spatial.distance import cdist
 
-from deepracer_exp.aws.logs.recording import Recording
+from deepracer_exp.aws.logs.recorded import Recording
 from deepracer_exp.aws.models.model_metadata import Action
 from deepracer_exp.config.bounds import FEWEST_ACTIONS, MOST_ACTIONS
 from deepracer_exp.config.car import CarConfig

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from deepracer_exp.aws.logs.recording import TRAINING
+from deepracer_exp.aws.logs.recorded import TRAINING
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.rewards.reward import Failure, RewardFailed, RewardFunction

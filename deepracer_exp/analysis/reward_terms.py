@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from deepracer_exp.aws.logs.recording import LogProblem
+from deepracer_exp.aws.logs.recorded import LogProblem
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.reward import Failure, RewardFunction, Unusable, answers

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from deepracer_exp.aws.logs.recording import TRAINING
+from deepracer_exp.aws.logs.recorded import TRAINING
 from deepracer_exp.compiled import njit
 from deepracer_exp.env.rules import lap_clock_s
 from deepracer_exp.evaluation.zigzag import STILL_M

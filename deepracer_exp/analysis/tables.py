@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 import pandas as pd
 
-from deepracer_exp.aws.logs.recording import Recording
+from deepracer_exp.aws.logs.recorded import Recording
 
 from .statistics import Values
 from .step_columns import first_rows, resets, whole_from_start

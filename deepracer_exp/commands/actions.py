@@ -205,8 +205,8 @@ def _of_track(what: str, is_route: bool, overrides: list[str], track: str | None
         raise BadInput(f"--track {track}: {what} is a track itself; accepted for a log of several tracks")
 
     from deepracer_exp.analysis.proposed_actions import commands_of_fastest
+    from deepracer_exp.aws.export.aws_files import services_metadata
     from deepracer_exp.config.overrides import group_of, override_line
-    from deepracer_exp.export.aws_files import services_metadata
 
     free = [] if any(group_of(override) == "action_space" for override in overrides) else FREE
     named = override_line("track.file" if is_route else "track", what)
@@ -222,7 +222,7 @@ def _of_run(what: str, stores: Stores, track: str | None) -> _Source:
 
     run = stores.find(what).with_policy(stores.values.get("checkpoint"))
 
-    from deepracer_exp.export.aws_files import services_metadata
+    from deepracer_exp.aws.export.aws_files import services_metadata
     from deepracer_exp.reports.driven_laps import commands_of_run
 
     with warnings_on_stderr():

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from deepracer_exp.analysis.charts.driving_line import EvaluatedLap
 from deepracer_exp.analysis.log_view import LogView
-from deepracer_exp.aws.logs.recording import LogProblem
+from deepracer_exp.aws.logs.recorded import LogProblem
 from deepracer_exp.config.own_class import OF_POLICY, named_again
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.evaluation.evaluator import Evaluator

@@ -32,7 +32,7 @@ from deepracer_exp.analysis.log_tables import (
 )
 from deepracer_exp.analysis.log_view import LogView
 from deepracer_exp.analysis.reward_replay import ReplayedRewards
-from deepracer_exp.aws.logs.recording import readable
+from deepracer_exp.aws.logs.recorded import readable
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.files import atomic_write
 from deepracer_exp.runs.next_steps import next_steps, official_place, outcome

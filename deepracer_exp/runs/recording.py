@@ -16,7 +16,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from deepracer_exp.aws.logs import sim_trace
 from deepracer_exp.aws.logs.reader import read_recording
-from deepracer_exp.aws.logs.recording import (
+from deepracer_exp.aws.logs.recorded import (
     METRICS_COLUMNS,
     STEP_COLUMNS,
     TRAINING,

@@ -9,7 +9,7 @@ import pandas as pd
 
 from deepracer_exp.analysis.log_course import catalogue_track
 from deepracer_exp.analysis.step_columns import FRONT_TO_REAR_AXLE_M
-from deepracer_exp.aws.logs.recording import METRICS_COLUMNS, STEP_COLUMNS, UPDATE_COLUMNS, Recording
+from deepracer_exp.aws.logs.recorded import METRICS_COLUMNS, STEP_COLUMNS, UPDATE_COLUMNS, Recording
 from deepracer_exp.aws.models.model_metadata import Action, ModelMetadata
 from deepracer_exp.tracks.sectors import waypoint_positions
 from deepracer_exp.tracks.track import Track

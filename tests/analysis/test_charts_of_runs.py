@@ -15,7 +15,7 @@ from deepracer_exp.analysis.charts.runs import (
     recordings_compared,
 )
 from deepracer_exp.analysis.log_view import LogView, prepare
-from deepracer_exp.aws.logs.recording import Round
+from deepracer_exp.aws.logs.recorded import Round
 
 from .chart_layers import layers
 from .made_up import Drive, made_up_recording

@@ -16,7 +16,7 @@ from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.step_columns import add_derived
 from deepracer_exp.analysis.tables import episode_table
 from deepracer_exp.aws.logs.reader import read_recording
-from deepracer_exp.aws.logs.recording import TRAINING, Recording
+from deepracer_exp.aws.logs.recorded import TRAINING, Recording
 from deepracer_exp.env.rules import lap_clock_s
 from tests.conftest import REFERENCE
 

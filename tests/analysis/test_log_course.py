@@ -10,7 +10,7 @@ import pytest
 from deepracer_exp.analysis.log_course import catalogue_track, find_courses, numbered_as_logged
 from deepracer_exp.analysis.log_view import prepare
 from deepracer_exp.aws.logs.reader import read_recording
-from deepracer_exp.aws.logs.recording import Recording
+from deepracer_exp.aws.logs.recorded import Recording
 from deepracer_exp.aws.worlds.routes import world_rows
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.errors import BadInput

@@ -12,7 +12,7 @@ from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.step_columns import DERIVED_COLUMNS
 from deepracer_exp.analysis.tables import EPISODE_COLUMNS, ITERATION_COLUMNS
 from deepracer_exp.aws.logs.reader import read_recording
-from deepracer_exp.aws.logs.recording import STEP_COLUMNS
+from deepracer_exp.aws.logs.recorded import STEP_COLUMNS
 
 from .made_up import Drive, made_up_course, made_up_recording
 

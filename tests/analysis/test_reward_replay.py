@@ -9,7 +9,7 @@ import pytest
 from deepracer_exp.analysis import reward_replay
 from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.reward_replay import ReplayedRewards
-from deepracer_exp.aws.logs.recording import STEP_COLUMNS
+from deepracer_exp.aws.logs.recorded import STEP_COLUMNS
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.env.trace import SCHEMA

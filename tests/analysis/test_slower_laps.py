@@ -10,7 +10,7 @@ from deepracer_exp.analysis.charts.training import training_progress
 from deepracer_exp.analysis.findings import findings
 from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.slower_laps import SERIES, SlowerLaps, slower_laps
-from deepracer_exp.aws.logs.recording import METRICS_COLUMNS, Recording
+from deepracer_exp.aws.logs.recorded import METRICS_COLUMNS, Recording
 from deepracer_exp.runs.recording import EVALUATION_COLUMNS, RunRecording
 from deepracer_exp.runs.run_result import RunResult
 

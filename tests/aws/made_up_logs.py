@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from deepracer_exp.aws.logs.recording import Recording
+from deepracer_exp.aws.logs.recorded import Recording
 from deepracer_exp.runs.recording import read_run_recording
 
 COMMON = (

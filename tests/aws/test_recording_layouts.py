@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from deepracer_exp.aws.logs.reader import read_recording
-from deepracer_exp.aws.logs.recording import METRICS_COLUMNS, STEP_COLUMNS, UPDATE_COLUMNS
+from deepracer_exp.aws.logs.recorded import METRICS_COLUMNS, STEP_COLUMNS, UPDATE_COLUMNS
 from tests.conftest import refused
 
 from . import made_up_logs as made

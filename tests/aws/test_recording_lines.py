@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from deepracer_exp.aws.logs import blocks, sim_trace, text_log
 from deepracer_exp.aws.logs.reader import read_recording
-from deepracer_exp.aws.logs.recording import Recording
+from deepracer_exp.aws.logs.recorded import Recording
 from deepracer_exp.errors import BadInput
 from tests.conftest import refused
 from tests.examples import examples

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from deepracer_exp.aws.logs.reader import read_recording
-from deepracer_exp.aws.logs.recording import Recording
+from deepracer_exp.aws.logs.recorded import Recording
 from tests.conftest import REFERENCE
 
 CONSOLE = REFERENCE / "console_training"

@@ -19,7 +19,7 @@ from deepracer_exp.analysis.log_tables import (
 )
 from deepracer_exp.analysis.log_view import LogView, prepare
 from deepracer_exp.analysis.reward_replay import ReplayedRewards
-from deepracer_exp.aws.logs.recording import LogProblem, Recording
+from deepracer_exp.aws.logs.recorded import LogProblem, Recording
 from deepracer_exp.errors import BadInput
 from deepracer_exp.reports.log_report import SECTIONS, LogPage, write_log_page
 from deepracer_exp.reports.log_report import html as page_html

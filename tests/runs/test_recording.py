@@ -10,11 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 
-from deepracer_exp.aws.logs.recording import (
-    METRICS_COLUMNS,
-    STEP_COLUMNS,
-    UPDATE_COLUMNS,
-)
+from deepracer_exp.aws.logs.recorded import METRICS_COLUMNS, STEP_COLUMNS, UPDATE_COLUMNS
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.env.trace import SCHEMA

@@ -11,7 +11,7 @@ import pandas as pd
 from deepracer_exp.analysis.evidence import iqm_band
 from deepracer_exp.analysis.log_view import LogView
 from deepracer_exp.analysis.statistics import Values, moving_average
-from deepracer_exp.aws.logs.recording import TRAINING
+from deepracer_exp.aws.logs.recorded import TRAINING
 from deepracer_exp.files import read_json
 from deepracer_exp.runs.lineage import clone_chain
 from deepracer_exp.runs.run_files import EVALUATIONS, METRICS

@@ -11,8 +11,8 @@ import pandas as pd
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from .files import Place
-from .recording import STEP_COLUMNS, typed_table
+from .log_files import Place
+from .recorded import STEP_COLUMNS, typed_table
 from .sim_trace import COMMON
 from .text_log import TrainingLog
 

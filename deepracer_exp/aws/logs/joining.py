@@ -16,9 +16,9 @@ from .drives import (
     repeated,
     rows_also_in,
 )
-from .files import LogFile, Place, place_of, without_worker
+from .log_files import LogFile, Place, place_of, without_worker
 from .parts import Parts, TraceFile
-from .recording import TRAINING, LogProblem
+from .recorded import TRAINING, LogProblem
 from .text_log import TrainingLog, join_rolled
 
 

@@ -17,8 +17,8 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.files import SETTINGS_BYTES, read_yaml
 
 from . import sim_trace
-from .files import LOG, LogFile, LogFolder, Place, place_of
-from .recording import CHECKPOINT, TRAINING, LogProblem
+from .log_files import LOG, LogFile, LogFolder, Place, place_of
+from .recorded import CHECKPOINT, TRAINING, LogProblem
 from .sim_trace import StepTables, read_trace_csv
 from .text_log import MARKER, TrainingLog, piece_of, read_training_logs
 

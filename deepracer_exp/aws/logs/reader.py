@@ -20,18 +20,10 @@ from .drives import (
     number_episodes,
     steps_of,
 )
-from .files import (
-    PACKED,
-    LogFile,
-    label,
-    log_folder,
-    named_parts,
-    place_of,
-    same_job,
-)
 from .joining import JoinedSteps, log_place, uppermost
+from .log_files import PACKED, LogFile, label, log_folder, named_parts, place_of, same_job
 from .parts import Parts, read_parts
-from .recording import (
+from .recorded import (
     CHECKPOINT,
     METRICS_COLUMNS,
     TRAINING,

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .blocks import Blocks
-from .files import LogFile
+from .log_files import LogFile
 from .sim_trace import LOG_LAYOUTS, StepTables, read_rows, with_plain_commas
 
 MARKER = b"SIM_TRACE_LOG:"

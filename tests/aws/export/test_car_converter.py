@@ -6,11 +6,16 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import torch
+from tests.export.test_car_archive import LEFT, SHORT, exported, unpacked
 
 from benchmarks.camera import read_frames
+from deepracer_exp.aws.export.car_converter import (
+    Conversion,
+    add_converted,
+    compare_in_openvino,
+    has_openvino,
+)
 from deepracer_exp.aws.models.graph_def import INPUTS, POLICY
-from deepracer_exp.export.car_converter import Conversion, add_converted, compare_in_openvino, has_openvino
-from tests.export.test_car_archive import LEFT, SHORT, exported, unpacked
 
 KINDS = [
     ("experiment=real_car",),

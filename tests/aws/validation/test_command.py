@@ -5,12 +5,12 @@ import pytest
 from matplotlib.image import imread
 
 from deepracer_exp.analysis.line_file import racing_line_table, write_line
+from deepracer_exp.aws.validation import validate as checking
+from deepracer_exp.aws.validation.short_training import compare_thirds
 from deepracer_exp.aws.worlds.routes import world_rows
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.rewards.source import zoo_names
 from deepracer_exp.tracks.track import world_track
-from deepracer_exp.validation import validate as checking
-from deepracer_exp.validation.short_training import compare_thirds
 
 pytestmark = pytest.mark.usefixtures("coarsely")
 

@@ -22,7 +22,7 @@ from deepracer_exp.aws.models.model_metadata import ModelMetadata
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.stored_run import StoredRun
 
-from .car_archive import CarArchive, export_car
+from .car_export import CarArchive, export_car
 from .onnx import DeployedPolicy
 from .written import Written
 

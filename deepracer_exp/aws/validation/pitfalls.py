@@ -8,10 +8,10 @@ import numpy as np
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.rewards.reward import RewardFunction
 
-from .laps import DrivenLap
 from .objects import QUIRKS, Floats, all_at
 from .probe import Probe
 from .reward_map import RewardGrid
+from .simple_driver import DrivenLap
 from .situations import Situations, near_the_start, quirky, sample, situations
 
 _QUIRKY = 150

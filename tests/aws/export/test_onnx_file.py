@@ -14,12 +14,12 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from deepracer_exp.agents.actor_critic import PolicyNetworks
 from deepracer_exp.agents.build import build_networks
+from deepracer_exp.aws.export import onnx as exporting
+from deepracer_exp.aws.export.onnx import TOLERANCE, DeployedPolicy, largest_difference, write_onnx
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.env.action_space import ActionSpace, build_action_space
 from deepracer_exp.errors import BadInput, RunFailed
-from deepracer_exp.export import onnx as exporting
-from deepracer_exp.export.onnx import TOLERANCE, DeployedPolicy, largest_difference, write_onnx
 
 FEATURES = tuple(f"feature_{number}" for number in range(19))
 OBSERVATIONS = torch.randn(50, len(FEATURES), generator=torch.Generator().manual_seed(2))

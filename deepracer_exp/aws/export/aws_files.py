@@ -12,6 +12,7 @@ from deepracer_exp.aws.models.model_metadata import (
     beyond_console,
     model_metadata_text,
 )
+from deepracer_exp.aws.validation.aws_rules import text_findings
 from deepracer_exp.config.custom_files import CARS, SAC_TAKEN, TAKEN
 from deepracer_exp.config.driving import ObservationConfig
 from deepracer_exp.config.experiment import Experiment
@@ -19,7 +20,6 @@ from deepracer_exp.config.learning import SACConfig
 from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.runs.stored_run import StoredRun
-from deepracer_exp.validation.aws_rules import text_findings
 
 from .written import Written, reward_text, write_files
 

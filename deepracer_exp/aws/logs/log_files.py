@@ -26,7 +26,7 @@ from deepracer_exp.aws.archives import (
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import LOG_BYTES, open_user_file
 
-from .recording import LogProblem, readable
+from .recorded import LogProblem, readable
 
 _ACCEPTED = "trace CSVs or logs of the service"
 

@@ -14,6 +14,8 @@ import torch
 from torch import nn
 
 from deepracer_exp.agents.build import build_networks
+from deepracer_exp.aws.export.car_export import CarArchive, car_actions, car_archive
+from deepracer_exp.aws.export.onnx import DeployedPolicy
 from deepracer_exp.aws.models.car_archive import check_weights, name_on_car
 from deepracer_exp.aws.models.graph_def import HEAD, INPUTS, POLICY, read_weights
 from deepracer_exp.aws.models.model_metadata import read_model_metadata
@@ -22,8 +24,6 @@ from deepracer_exp.env.action_space import ContinuousActions, build_action_space
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.env.real_car import check_car
 from deepracer_exp.errors import BadInput, RunFailed
-from deepracer_exp.export.car_archive import CarArchive, car_actions, car_archive
-from deepracer_exp.export.onnx import DeployedPolicy
 
 SMALL = ("observation=camera", "network=cnn_small")
 LEFT = ("action_space.steering_angle.low=-25", "action_space.steering_angle.high=27")

@@ -9,6 +9,9 @@ from PIL import Image
 from rich.console import Console
 from tensordict import TensorDict
 
+from deepracer_exp.aws.export.car_check import CarCheck, CarLaps, print_check
+from deepracer_exp.aws.export.car_converter import Conversion
+from deepracer_exp.aws.export.car_export import CarArchive, car_actions
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment
 from deepracer_exp.config.driving import CameraConfig
 from deepracer_exp.env.action_space import DiscreteActions
@@ -16,9 +19,6 @@ from deepracer_exp.evaluation.evaluate import CAR, SIMULATOR
 from deepracer_exp.evaluation.race_protocol import Attempt
 from deepracer_exp.evaluation.result import USUAL, Evaluation, TrialGroup
 from deepracer_exp.evaluation.zigzag import ZigZag
-from deepracer_exp.export.car_archive import CarArchive, car_actions
-from deepracer_exp.export.car_check import CarCheck, CarLaps, print_check
-from deepracer_exp.export.car_converter import Conversion
 from deepracer_exp.reports.picture_changes import CHANGES, pictures_sheet, spread_out, try_pictures
 
 CAMERA = CameraConfig(width=160, height=120, color="grey", frames=1, stereo_m=0.0, field_of_view_deg=65.0)

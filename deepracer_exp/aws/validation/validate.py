@@ -28,12 +28,12 @@ from . import pitfalls
 from .aws_dry_run import dry_run_findings
 from .aws_rules import AwsFinding, text_findings
 from .coverage import Coverage, never_executed
-from .laps import action_space_laps, flawed_laps
 from .objects import with_others
 from .pitfalls import LapReturn
 from .probe import NOT_CALLED, Answer, Probe, lines_for_step_1
 from .reward_map import RewardGrid, State, draw_reward_map, sample_reward_grid, state_of
 from .short_training import train_shortly
+from .simple_driver import action_space_laps, flawed_laps
 from .situations import (
     FIRST_STEP,
     NamedSituation,

@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
+from deepracer_exp.aws.validation.objects import object_outlines, with_others
+from deepracer_exp.aws.validation.situations import named_situations
+from deepracer_exp.aws.validation.validate import read
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.validation.objects import object_outlines, with_others
-from deepracer_exp.validation.situations import named_situations
-from deepracer_exp.validation.validate import read
 
 AVOID = """def reward_function(params):
     reward = 1.0

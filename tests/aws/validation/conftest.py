@@ -4,17 +4,17 @@ from pathlib import Path
 
 import pytest
 
+from deepracer_exp.aws.validation import reward_map
+from deepracer_exp.aws.validation import validate as checking
+from deepracer_exp.aws.validation.objects import with_others
+from deepracer_exp.aws.validation.simple_driver import DrivenLap, action_space_laps
+from deepracer_exp.aws.validation.validate import Check, look_closer, read, try_named_situations
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.driving import RewardConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.rewards.source import load_reward_source
 from deepracer_exp.tracks.track import Track
-from deepracer_exp.validation import reward_map
-from deepracer_exp.validation import validate as checking
-from deepracer_exp.validation.laps import DrivenLap, action_space_laps
-from deepracer_exp.validation.objects import with_others
-from deepracer_exp.validation.validate import Check, look_closer, read, try_named_situations
 
 
 @pytest.fixture(scope="session")

@@ -10,8 +10,8 @@ from deepracer_exp.runs.stored_run import StoredRun
 
 from .aws_files import export_files
 from .aws_model import export_model
-from .car_archive import export_car, name_in_exports
 from .car_converter import export_car_openvino
+from .car_export import export_car, name_in_exports
 from .onnx import export_onnx
 from .written import Written
 

@@ -44,8 +44,8 @@ from deepracer_exp.runs.checkpoint_files import checkpoint_words
 from deepracer_exp.runs.run_files import FILMS
 from deepracer_exp.runs.run_result import RELIABLE
 
-from .car_archive import CarArchive, car_archive
 from .car_converter import NEEDED, Conversion, compare_in_openvino, has_openvino
+from .car_export import CarArchive, car_archive
 from .onnx import DeployedPolicy
 
 LEAST_ON_CAR = 0.9

@@ -3,10 +3,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from deepracer_exp.aws.validation.simple_driver import (
+    SHARES,
+    Driver,
+    action_space_laps,
+    drive_laps,
+    flawed_laps,
+)
+from deepracer_exp.aws.validation.situations import named_situations, poses, sample, seam, situations, start
 from deepracer_exp.config.driving import DiscreteAction, DiscreteActionSpace
 from deepracer_exp.env.action_space import build_action_space
-from deepracer_exp.validation.laps import SHARES, Driver, action_space_laps, drive_laps, flawed_laps
-from deepracer_exp.validation.situations import named_situations, poses, sample, seam, situations, start
 
 
 def test_situations_are_where_they_were_requested(race):
