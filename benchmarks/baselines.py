@@ -18,8 +18,8 @@ FILE gets a line of JSON for each training as it ends. Those that it has are not
 benchmark continues, and seeds, tracks and algorithms can be added. The tables are of all that it holds:
 
 - for each algorithm, over tracks and seeds, the interquartile mean with its 95% interval by a bootstrap that resamples
-  seeds within their track (Agarwal et al., 2021, see `deepracer_exp.analysis.evidence`). A policy without a lap is
-  slower than any: a dash stands where more than a quarter have none, in an interval those of a resample;
+  seeds within their track (Agarwal et al., 2021, see `deepracer_exp.reports.tables.evidence`). A policy without a lap
+  is slower than any: a dash stands where more than a quarter have none, in an interval those of a resample;
 - for each track, the medians over seeds.
 """
 

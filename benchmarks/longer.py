@@ -39,12 +39,12 @@ from typing import Any
 
 import numpy as np
 
-from deepracer_exp.analysis.evidence import Interval, iqm_band
-from deepracer_exp.analysis.statistics import Values
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.setup import build_courses
 from deepracer_exp.evaluation.fastest.fastest_lap import Question, car_limits
+from deepracer_exp.reports.tables.evidence import Interval, iqm_band
+from deepracer_exp.reports.tables.statistics import Values
 
 from .command import at_once, read_metrics, trained
 from .fresh import Driven, drive

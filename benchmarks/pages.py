@@ -34,7 +34,7 @@ from pathlib import Path
 
 from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.env.setup import build_courses
-from deepracer_exp.reports.run_page import write_pictures, write_run_page
+from deepracer_exp.reports.pages.run_page import write_pictures, write_run_page
 from deepracer_exp.runs.run_files import read_config
 from deepracer_exp.training import callbacks, run
 

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import ttest_1samp
 
-from deepracer_exp.analysis.evidence import estimate
 from deepracer_exp.errors import BadInput
+from deepracer_exp.reports.tables.evidence import estimate
 
 CONFIDENCE = 0.95
 

@@ -20,7 +20,7 @@ from deepracer_exp.env.setup import build_setup
 from deepracer_exp.evaluation.evaluate import evaluate_run
 from deepracer_exp.evaluation.plan import plan_evaluation
 from deepracer_exp.evaluation.result import Evaluation
-from deepracer_exp.reports.run_page import RunReport
+from deepracer_exp.reports.pages.run_page import RunReport
 from deepracer_exp.runs.recording import read_run_recording
 from deepracer_exp.runs.run_files import METRICS, SUMMARY, read_config, read_metrics, read_object
 from deepracer_exp.tracking.resolve import resolve

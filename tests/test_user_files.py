@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from deepracer_exp.analysis.charts.runs import stored_completion
 from deepracer_exp.aws.models.archive import read_model
 from deepracer_exp.aws.models.hyperparameters import read_hyperparameters
 from deepracer_exp.aws.models.model_metadata import read_model_metadata
@@ -13,6 +12,7 @@ from deepracer_exp.aws.worlds.routes import read_knots, read_route
 from deepracer_exp.config.driving import RewardConfig
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import read_yaml
+from deepracer_exp.reports.charts.run_charts import stored_completion
 from deepracer_exp.rewards.source import load_reward_source
 from deepracer_exp.runs.best_run import read_best_of_sweep
 from deepracer_exp.runs.checkpoint_files import pinned, verify

@@ -15,9 +15,9 @@ from .pages import existing_logs
 from .tracks import ROUTES, experiment_on, search_fastest
 
 if TYPE_CHECKING:
-    from deepracer_exp.analysis.proposed_actions import ActionProposal, Commands
     from deepracer_exp.aws.models.model_metadata import ModelMetadata
     from deepracer_exp.config.car import CarConfig
+    from deepracer_exp.reports.tables.proposed_actions import ActionProposal, Commands
     from deepracer_exp.sweeps.plan import LapActions
 
 _EPILOG = """\
@@ -89,10 +89,10 @@ def _whole(text: str) -> int:
 
 
 def _actions(args: argparse.Namespace) -> int:
-    from deepracer_exp.analysis.proposed_actions import check_count, propose_actions
     from deepracer_exp.aws.models.model_metadata import model_metadata_text
     from deepracer_exp.config.imported_options import check_action_space_name, write_action_space
     from deepracer_exp.files import atomic_write
+    from deepracer_exp.reports.tables.proposed_actions import check_count, propose_actions
 
     sources, overrides = runs_and_overrides(args)
     if len(sources) != 1:
@@ -110,7 +110,7 @@ def _actions(args: argparse.Namespace) -> int:
     check_action_space_name(name)
     proposal = propose_actions(source.commands.within(source.car), args.count, source.car)
 
-    from deepracer_exp.analysis.charts.proposed_actions import proposed_actions_picture
+    from deepracer_exp.reports.charts.proposal_charts import proposed_actions_picture
 
     metadata = replace(
         source.metadata, actions=proposal.actions, low=None, high=None, training_algorithm="clipped_ppo"
@@ -136,9 +136,9 @@ def write_lap_actions(wanted: "LapActions") -> None:
         BadInput: a file cannot be written.
         RunFailed: no lap is possible.
     """
-    from deepracer_exp.analysis.proposed_actions import commands_of_fastest, propose_actions
     from deepracer_exp.config.imported_options import check_action_space_name, write_action_space
     from deepracer_exp.config.options import options
+    from deepracer_exp.reports.tables.proposed_actions import commands_of_fastest, propose_actions
 
     missing = {name: count for name, count in wanted.counts.items() if name not in options("action_space")}
     for name in missing:
@@ -188,10 +188,10 @@ def _source(what: str, overrides: list[str], track: str | None) -> _Source:
     if stores.values:
         raise BadInput(f"checkpoint={stores.values['checkpoint']}: {what} is a log; accepted for a run")
 
-    from deepracer_exp.analysis.proposed_actions import commands_of_log
     from deepracer_exp.aws.logs.reader import read_recording
     from deepracer_exp.aws.models.model_metadata import ModelMetadata
     from deepracer_exp.config.named import service_car
+    from deepracer_exp.reports.tables.proposed_actions import commands_of_log
 
     recording = read_recording(place)
     commands = commands_of_log(recording, track)
@@ -204,9 +204,9 @@ def _of_track(what: str, is_route: bool, overrides: list[str], track: str | None
     if track is not None:
         raise BadInput(f"--track {track}: {what} is a track itself; accepted for a log of several tracks")
 
-    from deepracer_exp.analysis.proposed_actions import commands_of_fastest
     from deepracer_exp.aws.export.aws_files import services_metadata
     from deepracer_exp.config.overrides import group_of, override_line
+    from deepracer_exp.reports.tables.proposed_actions import commands_of_fastest
 
     free = [] if any(group_of(override) == "action_space" for override in overrides) else FREE
     named = override_line("track.file" if is_route else "track", what)
@@ -223,7 +223,7 @@ def _of_run(what: str, stores: Stores, track: str | None) -> _Source:
     run = stores.find(what).with_policy(stores.values.get("checkpoint"))
 
     from deepracer_exp.aws.export.aws_files import services_metadata
-    from deepracer_exp.reports.driven_laps import commands_of_run
+    from deepracer_exp.reports.pages.driven_laps import commands_of_run
 
     with warnings_on_stderr():
         commands = commands_of_run(run)

@@ -19,8 +19,8 @@ from .pages import (
 )
 
 if TYPE_CHECKING:
-    from deepracer_exp.analysis.log_view import LogView
     from deepracer_exp.config.car import CarConfig
+    from deepracer_exp.reports.tables.log_view import LogView
 
 _EPILOG = """\
   deepracer-exp analyze RUN                                 one of our runs
@@ -78,7 +78,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def _analyze(args: argparse.Namespace) -> int:
-    from deepracer_exp.analysis.line_file import check_line_file
+    from deepracer_exp.reports.tables.line_file import check_line_file
 
     target_s = None if args.target is None else _seconds(args.target)
 
@@ -98,13 +98,13 @@ def _analyze(args: argparse.Namespace) -> int:
 
         reward = named_reward_source(args.reward)
 
-    from deepracer_exp.analysis.beside import other_tracks
-    from deepracer_exp.analysis.findings import findings
-    from deepracer_exp.analysis.log_tables import headline, result_in_words, trainings
-    from deepracer_exp.analysis.log_view import prepare
-    from deepracer_exp.analysis.reward_replay import replay_reward
-    from deepracer_exp.analysis.reward_terms import run_terms
-    from deepracer_exp.reports.log_report import LogPage, write_log_page
+    from deepracer_exp.reports.findings import findings
+    from deepracer_exp.reports.pages.log_report import LogPage, write_log_page
+    from deepracer_exp.reports.tables.beside import other_tracks
+    from deepracer_exp.reports.tables.log_tables import headline, result_in_words, trainings
+    from deepracer_exp.reports.tables.log_view import prepare
+    from deepracer_exp.reports.tables.reward_replay import replay_reward
+    from deepracer_exp.reports.tables.reward_terms import run_terms
     from deepracer_exp.runs.recording import is_traced_run, read_log
     from deepracer_exp.runs.run_files import read_config
 
@@ -123,7 +123,7 @@ def _analyze(args: argparse.Namespace) -> int:
     view, terms = run_terms(prepare(log, args.track), car)
     best = None
     if config:
-        from deepracer_exp.reports.best_drive import drive_best
+        from deepracer_exp.reports.pages.best_drive import drive_best
 
         view, best = drive_best(view, place)
     if args.fastest:
@@ -167,8 +167,8 @@ def _write_laps_asked_for(args: argparse.Namespace, view: "LogView", episode: in
     Raises:
         BadInput: the log has no such lap, or a file cannot be written.
     """
-    from deepracer_exp.analysis.line_file import recorded_line, write_line
-    from deepracer_exp.reports.lap_replay import laps_of_log
+    from deepracer_exp.reports.pages.lap_replay import laps_of_log
+    from deepracer_exp.reports.tables.line_file import recorded_line, write_line
 
     line = None if args.line is None else recorded_line(view, episode)
     written = []
@@ -217,7 +217,7 @@ def _seconds(text: str) -> float:
 
 def _find_fastest(view: "LogView", place: Path) -> None:
     """Search for the fastest lap of a run's car, unless an earlier search has kept it."""
-    from deepracer_exp.analysis.against_fastest import question_of
+    from deepracer_exp.reports.tables.against_fastest import question_of
     from deepracer_exp.runs.recording import is_traced_run
 
     from .tracks import search_fastest

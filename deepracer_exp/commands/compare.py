@@ -24,7 +24,7 @@ from .pages import (
 )
 
 if TYPE_CHECKING:
-    from deepracer_exp.analysis.log_view import LogView
+    from deepracer_exp.reports.tables.log_view import LogView
 
 _EPILOG = """\
   deepracer-exp compare RUN RUN                             how two runs differ, and what each achieved
@@ -120,16 +120,16 @@ def _item(word: str, group: str | None, stores: Stores) -> Item:
 
 def _compare_recordings(args: argparse.Namespace, items: Sequence[Item]) -> int:
     """Compare the learning curves of logs, and of runs among them."""
-    from deepracer_exp.analysis.beside import evaluated_in_training
-    from deepracer_exp.analysis.charts.runs import (
+    from deepracer_exp.reports.charts.run_charts import (
         generalisation_matrix,
         generations,
         policy_of,
         recordings_compared,
     )
-    from deepracer_exp.analysis.log_tables import NONE, Table, headline
-    from deepracer_exp.analysis.log_view import prepare
-    from deepracer_exp.reports.lap_replay import laps_of_log
+    from deepracer_exp.reports.pages.lap_replay import laps_of_log
+    from deepracer_exp.reports.tables.beside import evaluated_in_training
+    from deepracer_exp.reports.tables.log_tables import NONE, Table, headline
+    from deepracer_exp.reports.tables.log_view import prepare
     from deepracer_exp.runs.recording import read_log
 
     named: list[tuple[str | None, LogView]] = []

@@ -16,9 +16,9 @@ from .output import print_table, table_console
 from .pages import Item, end_with_page, light, write_comparison_page, write_laps
 
 if TYPE_CHECKING:
-    from deepracer_exp.analysis.charts.figure import Chart
-    from deepracer_exp.analysis.groups import RunGroup
-    from deepracer_exp.analysis.log_tables import Table
+    from deepracer_exp.reports.charts.figure import Chart
+    from deepracer_exp.reports.tables.groups import RunGroup
+    from deepracer_exp.reports.tables.log_tables import Table
     from deepracer_exp.runs.run_files import RunRecord
 
 _RUNS = "Runs"
@@ -41,9 +41,9 @@ _DIFFERENCES = (
 
 def compare_runs(args: argparse.Namespace, items: Sequence[Item]) -> int:
     """Compare runs, and groups of them."""
-    from deepracer_exp.analysis.group_curves import curves_table
-    from deepracer_exp.analysis.group_tables import groups_as_json
-    from deepracer_exp.analysis.groups import compared
+    from deepracer_exp.reports.tables.group_curves import curves_table
+    from deepracer_exp.reports.tables.group_tables import groups_as_json
+    from deepracer_exp.reports.tables.groups import compared
 
     groups = _groups(items)
     records = [record for group in groups for record in group.records]
@@ -58,7 +58,7 @@ def compare_runs(args: argparse.Namespace, items: Sequence[Item]) -> int:
 
         stored = [StoredRun(record.path).with_policy() for record in records]
 
-        from deepracer_exp.reports.driven_laps import laps_to_replay
+        from deepracer_exp.reports.pages.driven_laps import laps_to_replay
 
         protocol = stored[0].experiment.evaluation
         (first,) = laps_to_replay(stored[0], protocol)
@@ -70,7 +70,7 @@ def compare_runs(args: argparse.Namespace, items: Sequence[Item]) -> int:
 
 def _groups(items: Sequence[Item]) -> "list[RunGroup]":
     """Return the groups of runs; an experiment among several keeps its name."""
-    from deepracer_exp.analysis.groups import RunGroup, group_runs
+    from deepracer_exp.reports.tables.groups import RunGroup, group_runs
     from deepracer_exp.runs.run_files import read_record
 
     records: dict[Path, RunRecord] = {}
@@ -127,10 +127,10 @@ def _show(
     records: "list[RunRecord]",
 ) -> None:
     """Print the comparison and write the page."""
-    from deepracer_exp.analysis.charts.groups import best_checkpoints, learning_curve_charts
-    from deepracer_exp.analysis.charts.runs import generalisation_matrix, stored_completion
-    from deepracer_exp.analysis.group_tables import differences_table, scored, sentences, title_of
-    from deepracer_exp.analysis.groups import RunGroup, compared, course_of
+    from deepracer_exp.reports.charts.group_charts import best_checkpoints, learning_curve_charts
+    from deepracer_exp.reports.charts.run_charts import generalisation_matrix, stored_completion
+    from deepracer_exp.reports.tables.group_tables import differences_table, scored, sentences, title_of
+    from deepracer_exp.reports.tables.groups import RunGroup, compared, course_of
 
     single = all(len(group.records) == 1 for group in groups)
     if single:
@@ -172,8 +172,8 @@ def _run_tables(groups: "Sequence[RunGroup]") -> "list[tuple[str, Table, str]]":
 
     With several groups of several runs, settings are those of the groups, and results of single runs are left out.
     """
-    from deepracer_exp.analysis.comparison import results, value_text
-    from deepracer_exp.analysis.log_tables import Table
+    from deepracer_exp.reports.tables.comparison import results, value_text
+    from deepracer_exp.reports.tables.log_tables import Table
     from deepracer_exp.runs.lineage import run_differences
 
     records = [record for group in groups for record in group.records]
@@ -198,8 +198,8 @@ def _run_tables(groups: "Sequence[RunGroup]") -> "list[tuple[str, Table, str]]":
 
 def _generations(records: "Sequence[RunRecord]") -> "Chart | None":
     """Draw a run and the clones of it on one axis of iterations; None where there are none, or without their traces."""
-    from deepracer_exp.analysis.charts.runs import generations
-    from deepracer_exp.analysis.log_view import prepare
+    from deepracer_exp.reports.charts.run_charts import generations
+    from deepracer_exp.reports.tables.log_view import prepare
     from deepracer_exp.runs.lineage import clone_chain
     from deepracer_exp.runs.recording import read_log
 

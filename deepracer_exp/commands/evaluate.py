@@ -213,7 +213,7 @@ def _watch(args: argparse.Namespace) -> int:
     if not args.live:
         plan = _planned(args, run, overrides)
 
-        from deepracer_exp.reports.watch import film_run
+        from deepracer_exp.reports.pages.watch import film_run
 
         file = None if args.output is None else Path(args.output)
         with warnings_on_stderr():
@@ -226,7 +226,7 @@ def _watch(args: argparse.Namespace) -> int:
                 plan.rival,
             )
         return 0
-    from deepracer_exp.reports.live_server import LiveServer
+    from deepracer_exp.reports.pages.live_server import LiveServer
 
     # Its first checkpoint may be still to come.
     plan = _planned(args, run, overrides, has_checkpoint=False)
@@ -234,7 +234,7 @@ def _watch(args: argparse.Namespace) -> int:
     with LiveServer(args.port or 0) as server, warnings_on_stderr():
         print(server.url, flush=True)
 
-        from deepracer_exp.reports.live import serve_live
+        from deepracer_exp.reports.pages.live_page import serve_live
         from deepracer_exp.training.budget import Budget
 
         used = Budget(plan.run.experiment.budget).used
@@ -259,8 +259,8 @@ def _replay_laps(args: argparse.Namespace) -> int:
 
         place = Path(runs[1]).expanduser()
         if place.exists() and not is_run(place):
-            from deepracer_exp.analysis.log_view import prepare_races
             from deepracer_exp.aws.logs.reader import read_recording
+            from deepracer_exp.reports.tables.log_view import prepare_races
 
             view = prepare_races(read_recording(place))
         else:
@@ -268,8 +268,8 @@ def _replay_laps(args: argparse.Namespace) -> int:
 
             rival = resolve(runs[1], Path(plan.config.runs_dir), plan.config.tracking.uri).with_policy()
 
-    from deepracer_exp.reports.driven_laps import laps_to_replay
-    from deepracer_exp.reports.lap_replay import fastest_lap_of_log
+    from deepracer_exp.reports.pages.driven_laps import laps_to_replay
+    from deepracer_exp.reports.pages.lap_replay import fastest_lap_of_log
 
     protocol = plan.config.evaluation
     with warnings_on_stderr():
@@ -325,7 +325,7 @@ def _checkpoints(args: argparse.Namespace) -> int:
     check_file("--output", args.output, ".html")
     plan = _planned(args, *run_and_overrides(args))
 
-    from deepracer_exp.reports.checkpoint_comparison import show_checkpoints
+    from deepracer_exp.reports.pages.checkpoint_comparison import show_checkpoints
 
     progress = plain_console(stderr=True)
     with warnings_on_stderr():

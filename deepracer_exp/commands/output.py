@@ -26,8 +26,8 @@ from deepracer_exp.runs.run_result import FAILED, RELIABLE, fastest_reliable, wh
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from deepracer_exp.analysis.log_tables import Table
     from deepracer_exp.config.running import TrackingConfig
+    from deepracer_exp.reports.tables.log_tables import Table
     from deepracer_exp.training.result import TrainResult
 
 _FILES = {
@@ -209,8 +209,8 @@ def print_results(outcomes: "Sequence[TrainResult]", tracking: "TrackingConfig")
 
 def _print_groups(runs: "Sequence[Path]") -> None:
     """Print the tables of groups, where one of them has several runs."""
-    from deepracer_exp.analysis.group_tables import differences_table, scored, sentences, title_of
-    from deepracer_exp.analysis.groups import compared, group_runs
+    from deepracer_exp.reports.tables.group_tables import differences_table, scored, sentences, title_of
+    from deepracer_exp.reports.tables.groups import compared, group_runs
     from deepracer_exp.runs.next_steps import own_word
     from deepracer_exp.runs.run_files import read_head
 

@@ -13,10 +13,10 @@ from deepracer_exp.runs.run_files import is_run
 from .arguments import Stores
 
 if TYPE_CHECKING:
-    from deepracer_exp.analysis.charts.figure import Chart
-    from deepracer_exp.analysis.log_tables import Table
-    from deepracer_exp.analysis.log_view import LogView
-    from deepracer_exp.reports.lap_replay import ReplayedLap
+    from deepracer_exp.reports.charts.figure import Chart
+    from deepracer_exp.reports.pages.lap_replay import ReplayedLap
+    from deepracer_exp.reports.tables.log_tables import Table
+    from deepracer_exp.reports.tables.log_view import LogView
     from deepracer_exp.runs.stored_run import StoredRun
 
 _ACCEPTED = "logs of the service, or a run"
@@ -46,7 +46,7 @@ def write_laps(page: str, laps: "Sequence[ReplayedLap]") -> None:
     Raises:
         BadInput: they are not on the same track, or it cannot be written.
     """
-    from deepracer_exp.reports.lap_replay import write_replay
+    from deepracer_exp.reports.pages.lap_replay import write_replay
 
     with writing(f"--replay {page}"):
         write_replay(Path(page), laps)
@@ -134,7 +134,7 @@ def write_comparison_page(
     Raises:
         BadInput: it cannot be written.
     """
-    from deepracer_exp.reports.comparison_page import write_comparison
+    from deepracer_exp.reports.pages.comparison_page import write_comparison
 
     words = list(dict.fromkeys(item.group or Path(item.word).name for item in items))
     out = Path(output or page_name("comparison", "-".join(words[:3])))

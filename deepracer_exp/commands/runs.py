@@ -186,7 +186,7 @@ def _label(member: "FamilyMember", run: Path, best: dict[int, str]) -> "Text":
     """Return lines on a run: its name, where it comes from, what it achieved, and what it changed."""
     from rich.text import Text
 
-    from deepracer_exp.analysis.comparison import value_text
+    from deepracer_exp.reports.tables.comparison import value_text
     from deepracer_exp.runs.checkpoint_files import checkpoint_words
 
     asked_for = member.path == run.resolve()

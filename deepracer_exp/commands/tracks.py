@@ -136,8 +136,8 @@ def _list_tracks() -> None:
 
 def _show_track(args: argparse.Namespace) -> None:
     """Draw a track, or a route file (.npy, .yaml), in the terminal; write the requested files."""
-    from deepracer_exp.analysis.line_file import check_line_file, racing_line_table, write_line
     from deepracer_exp.config.overrides import override_line
+    from deepracer_exp.reports.tables.line_file import check_line_file, racing_line_table, write_line
     from deepracer_exp.tracks.drawing import draw_picture, draw_terminal
 
     is_file = Path(args.name).suffix in ROUTES

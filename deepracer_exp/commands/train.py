@@ -134,7 +134,7 @@ def _train(args: argparse.Namespace) -> int:
     print_start()
     start_workers_early(any(plan.experiment.collector.forks for plan in plans))
 
-    from deepracer_exp.reports.run_page import RunReport
+    from deepracer_exp.reports.pages.run_page import RunReport
     from deepracer_exp.tracking.projector import Projector
     from deepracer_exp.training.run import run_training, try_out
 
@@ -187,7 +187,7 @@ def _continue(plan: "ResumePlan | TrainPlan") -> int:
     print_start()
     start_workers_early(plan.experiment.collector.forks)
 
-    from deepracer_exp.reports.run_page import RunReport
+    from deepracer_exp.reports.pages.run_page import RunReport
     from deepracer_exp.training.run import run_training
 
     with warnings_on_stderr():

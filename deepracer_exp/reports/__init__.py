@@ -1,1 +1,1 @@
-"""Pages, films of a policy's view, and comparisons: the results of analysis and evaluation."""
+"""Tables of logs and runs, findings in them, charts, and the pages that show them."""

@@ -17,7 +17,7 @@ from optuna.trial import FrozenTrial
 
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL
-from deepracer_exp.reports.run_page import RunReport
+from deepracer_exp.reports.pages.run_page import RunReport
 from deepracer_exp.runs.checkpoint_files import checkpoint_words
 from deepracer_exp.runs.run_files import is_run
 from deepracer_exp.runs.run_result import FAILED, INTERRUPTED

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from deepracer_exp.analysis.findings import findings
-from deepracer_exp.analysis.log_tables import facts
-from deepracer_exp.analysis.log_view import prepare
 from deepracer_exp.aws.logs.reader import read_recording
+from deepracer_exp.reports.findings import findings
+from deepracer_exp.reports.tables.log_tables import facts
+from deepracer_exp.reports.tables.log_view import prepare
 
 from . import made_up_logs as made
 

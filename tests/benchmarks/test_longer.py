@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks import longer
 from benchmarks.fresh import Driven
-from deepracer_exp.analysis.evidence import estimate
+from deepracer_exp.reports.tables.evidence import estimate
 
 
 def test_each_seed_of_each_group_is_trained_once_and_laps_are_held_against_the_bound(

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from deepracer_exp.errors import BadInput
-from deepracer_exp.reports import log_report
+from deepracer_exp.reports.pages import log_report
 from deepracer_exp.runs import recording as run_recording
 from tests.aws.made_up_logs import drives, log_text
 from tests.page_html import Html

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.analysis.made_up_runs import made_up_run, made_up_seeds
 from tests.aws.made_up_logs import write_run_as_logs
 from tests.page_html import Html
+from tests.reports.tables.made_up_runs import made_up_run, made_up_seeds
 
 LAPS = ("track=Straight_track", "action_space=deepracer", "reward=progress_delta", "budget.env_steps=16384")
 

@@ -4,8 +4,6 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from deepracer_exp.analysis.findings import findings
-from deepracer_exp.analysis.log_view import prepare
 from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.placement import rebuild_poses
@@ -13,7 +11,9 @@ from deepracer_exp.env.trace import STATUS_CODE
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.trace import TraceRecorder, pauses_left_s
-from deepracer_exp.reports.log_report import LogPage, draw_sections
+from deepracer_exp.reports.findings import findings
+from deepracer_exp.reports.pages.log_report import LogPage, draw_sections
+from deepracer_exp.reports.tables.log_view import prepare
 from deepracer_exp.runs.recording import read_log
 from deepracer_exp.runs.trace import EVALUATION_OTHERS
 

@@ -8,17 +8,17 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from deepracer_exp.analysis.charts.runs import speed_and_stability
 from deepracer_exp.evaluation.result import Evaluation
-from deepracer_exp.reports.checkpoint_comparison import (
+from deepracer_exp.reports.charts.run_charts import speed_and_stability
+from deepracer_exp.reports.pages.checkpoint_comparison import (
     CheckpointResult,
     LapStatistics,
     comparison_table,
     lap_statistics,
     recommend,
 )
-from tests.analysis.chart_layers import drawn
 from tests.evaluation.test_result import attempt, group
+from tests.reports.tables.chart_layers import drawn
 
 
 def figures(

@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepracer_exp.analysis.log_view import LogView, prepare
-from deepracer_exp.reports.lap_replay import laps_of_log, write_replay
-from tests.analysis.made_up import Drive, made_up_course, made_up_recording
+from deepracer_exp.reports.pages.lap_replay import laps_of_log, write_replay
+from deepracer_exp.reports.tables.log_view import LogView, prepare
 from tests.browser import needs_chromium
 from tests.conftest import refused
 from tests.page_html import Html
+from tests.reports.tables.made_up import Drive, made_up_course, made_up_recording
 
 FAST, SLOW = Drive(speed_mps=2.0, offset_m=0.1), Drive(speed_mps=1.6, offset_m=-0.1)
 

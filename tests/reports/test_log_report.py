@@ -7,27 +7,28 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from deepracer_exp.analysis.charts.driving_line import raced_lap
-from deepracer_exp.analysis.finding import FIGURES
-from deepracer_exp.analysis.findings import findings
-from deepracer_exp.analysis.log_tables import (
+from deepracer_exp.aws.logs.recorded import LogProblem, Recording
+from deepracer_exp.errors import BadInput
+from deepracer_exp.reports.charts.driving_line import raced_lap
+from deepracer_exp.reports.charts.reward_charts import replayed_charts
+from deepracer_exp.reports.finding import FIGURES
+from deepracer_exp.reports.findings import findings
+from deepracer_exp.reports.pages.log_report import SECTIONS, LogPage, write_log_page
+from deepracer_exp.reports.pages.log_report import html as page_html
+from deepracer_exp.reports.tables.log_tables import (
     MOST_ITERATIONS,
     facts,
     headline,
     iteration_rows,
     result_in_words,
 )
-from deepracer_exp.analysis.log_view import LogView, prepare
-from deepracer_exp.analysis.reward_replay import ReplayedRewards
-from deepracer_exp.aws.logs.recorded import LogProblem, Recording
-from deepracer_exp.errors import BadInput
-from deepracer_exp.reports.log_report import SECTIONS, LogPage, write_log_page
-from deepracer_exp.reports.log_report import html as page_html
+from deepracer_exp.reports.tables.log_view import LogView, prepare
+from deepracer_exp.reports.tables.reward_replay import ReplayedRewards
 from deepracer_exp.runs.recording import RunRecording
 from deepracer_exp.runs.run_result import RunResult
-from tests.analysis.made_up import Drive, made_up_recording
 from tests.browser import needs_chromium
 from tests.page_html import Html
+from tests.reports.tables.made_up import Drive, made_up_recording
 
 NASTY = "</script><script>alert(1)</script><img src=x onerror=alert(2)>&'\"{{7*7}}"
 
@@ -294,7 +295,7 @@ def test_another_reward_is_reported_with_the_ranks_of_laps_and_places(view):
     assert "mine -1.00, recorded reward 1.00; between both rewards -1.00" in replayed.sentences[1]
     assert "waypoint 0 gains most and waypoint 20 loses most" in replayed.sentences[2]
     assert replayed.best_laps.rows[0][:3] == ("1", "3", "1")
-    assert [chart.name for chart in replayed.charts] == ["replayed_laps", "replayed_places"]
+    assert [chart.name for chart in replayed_charts(replayed)] == ["replayed_laps", "replayed_places"]
     text = Html(page_html(LogPage(view, findings(view), replay=replayed))).text
     assert text.index(replayed.sentences[0]) < text.rindex("The fastest exploring laps")
 

@@ -30,11 +30,11 @@ from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.film import Lap, LapRecorder, drive_best_lap, in_frames, write_film
-from deepracer_exp.reports import live
-from deepracer_exp.reports.live import LivePage, track_lines
-from deepracer_exp.reports.live_server import LiveServer
-from deepracer_exp.reports.sight import picture_of, saliency
-from deepracer_exp.reports.watch import HEIGHT, WIDTH, Frames, rays
+from deepracer_exp.reports.pages import live_page as live
+from deepracer_exp.reports.pages.live_page import LivePage, track_lines
+from deepracer_exp.reports.pages.live_server import LiveServer
+from deepracer_exp.reports.pages.sight import picture_of, saliency
+from deepracer_exp.reports.pages.watch import HEIGHT, WIDTH, Frames, rays
 from deepracer_exp.runs.run_files import read_metrics
 from deepracer_exp.runs.stored_run import StoredRun
 from deepracer_exp.sim.lidar import MOUNT_X_M

@@ -5,12 +5,12 @@ import pandas as pd
 import pytest
 import yaml
 
-from deepracer_exp.analysis.findings import findings
-from deepracer_exp.analysis.log_view import prepare
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.trace import PACKED_COLUMNS, STATUS_CODE, to_table
 from deepracer_exp.errors import BadInput
-from deepracer_exp.reports.log_report import LogPage, draw_sections
+from deepracer_exp.reports.findings import findings
+from deepracer_exp.reports.pages.log_report import LogPage, draw_sections
+from deepracer_exp.reports.tables.log_view import prepare
 from deepracer_exp.runs.recording import LAPS_ONLY, read_run_recording
 from deepracer_exp.runs.trace import LapWriter, read_trace, rewind_trace
 

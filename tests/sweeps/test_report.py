@@ -3,8 +3,8 @@ import re
 import pytest
 from optuna.distributions import FloatDistribution
 
-from deepracer_exp.analysis.evidence import SAME
 from deepracer_exp.errors import BadInput
+from deepracer_exp.reports.tables.evidence import SAME
 from deepracer_exp.sweeps.report.best import over_seeds
 from deepracer_exp.sweeps.report.labels import short_keys
 from deepracer_exp.sweeps.report.page import study_page, study_summary, write_study_page

@@ -10,7 +10,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment
 from deepracer_exp.config.sweep import compose_sweep
-from deepracer_exp.reports import run_page
+from deepracer_exp.reports.pages import run_page
 from deepracer_exp.sweeps.queue.claims import TrialClaims
 from deepracer_exp.sweeps.queue.storage import open_storage
 from deepracer_exp.sweeps.queue.study import open_study

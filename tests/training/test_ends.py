@@ -9,13 +9,13 @@ import threading
 
 import pytest
 
-from deepracer_exp.analysis.findings import findings
-from deepracer_exp.analysis.log_tables import headline
-from deepracer_exp.analysis.log_view import prepare
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.setup import build_courses
-from deepracer_exp.reports.run_page import write_pictures
+from deepracer_exp.reports.findings import findings
+from deepracer_exp.reports.pages.run_page import write_pictures
+from deepracer_exp.reports.tables.log_tables import headline
+from deepracer_exp.reports.tables.log_view import prepare
 from deepracer_exp.runs.recording import read_run_recording
 from deepracer_exp.training.stopping.stopping_rules import build_rule
 from tests.waiting import wait_until

@@ -39,7 +39,7 @@ from deepracer_exp.evaluation.race_protocol import RaceProtocol
 from deepracer_exp.evaluation.result import USUAL, Evaluation, number
 from deepracer_exp.evaluation.zigzag import CURE, ZIGZAG_DEG, ZIGZAG_PER_M, ZigZag
 from deepracer_exp.files import atomic_write
-from deepracer_exp.reports.picture_changes import TriedPictures, pictures_sheet, try_pictures
+from deepracer_exp.reports.pages.picture_changes import TriedPictures, pictures_sheet, try_pictures
 from deepracer_exp.runs.checkpoint_files import checkpoint_words
 from deepracer_exp.runs.run_files import FILMS
 from deepracer_exp.runs.run_result import RELIABLE

@@ -21,7 +21,7 @@ def train_shortly(err: Console, plan: TrainPlan) -> list[str]:
         RunFailed: the training failed.
         KeyboardInterrupt: it was interrupted.
     """
-    from deepracer_exp.reports.run_page import RunReport
+    from deepracer_exp.reports.pages.run_page import RunReport
     from deepracer_exp.training.run import run_training
 
     outcome = run_training(plan, err, report=RunReport())

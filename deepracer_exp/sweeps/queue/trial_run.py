@@ -17,7 +17,7 @@ from deepracer_exp.errors import RunFailed
 from deepracer_exp.evaluation.evaluate import write_evaluation
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL
-from deepracer_exp.reports.run_page import RunReport
+from deepracer_exp.reports.pages.run_page import RunReport
 from deepracer_exp.runs.checkpoint_files import kept_checkpoints
 from deepracer_exp.runs.folder import is_held
 from deepracer_exp.runs.run_files import (

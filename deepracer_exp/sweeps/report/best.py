@@ -9,8 +9,8 @@ import numpy as np
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
-from deepracer_exp.analysis.evidence import Values, difference, estimate
 from deepracer_exp.errors import BadInput
+from deepracer_exp.reports.tables.evidence import Values, difference, estimate
 from deepracer_exp.runs.best_run import BestOfSweep, write_best_of_sweep
 from deepracer_exp.runs.run_files import is_run
 from deepracer_exp.runs.run_result import FRESH_LAPS, SWEEP_LAPS

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
-from deepracer_exp.analysis.charts.style import FAINT, GRID, NARROW_WIDTH, SPINE, Figure, base_layout
+from deepracer_exp.reports.charts.style import FAINT, GRID, NARROW_WIDTH, SPINE, Figure, base_layout
 from deepracer_exp.sweeps.search.objectives import MEASURES, objectives_of
 
 if TYPE_CHECKING:

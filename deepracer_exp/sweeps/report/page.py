@@ -13,7 +13,7 @@ from deepracer_exp.config.overrides import key_of
 from deepracer_exp.config.own_class import OF_POLICY
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.files import atomic_write, read_bytes
-from deepracer_exp.reports.page import plot, render
+from deepracer_exp.reports.pages.page import plot, render
 from deepracer_exp.runs.next_steps import COMMAND, FURTHER, SECOND_PHASE, STABLE, command_line
 from deepracer_exp.runs.next_steps import outcome as run_outcome
 from deepracer_exp.runs.run_files import BEST_LAP, read_config, read_head, sees_pictures

@@ -19,7 +19,7 @@ from deepracer_exp.evaluation.evaluate import CAR, SIMULATOR
 from deepracer_exp.evaluation.race_protocol import Attempt
 from deepracer_exp.evaluation.result import USUAL, Evaluation, TrialGroup
 from deepracer_exp.evaluation.zigzag import ZigZag
-from deepracer_exp.reports.picture_changes import CHANGES, pictures_sheet, spread_out, try_pictures
+from deepracer_exp.reports.pages.picture_changes import CHANGES, pictures_sheet, spread_out, try_pictures
 
 CAMERA = CameraConfig(width=160, height=120, color="grey", frames=1, stereo_m=0.0, field_of_view_deg=65.0)
 ACTIONS = DiscreteActions(np.array([-20.0, 20.0]), np.array([1.0, 2.0]))
