@@ -28,7 +28,7 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.learning import MLPConfig, PPOConfig, SACConfig
 from deepracer_exp.env.sb3 import DeepRacerVecEnv
 from deepracer_exp.env.setup import build_setup
-from deepracer_exp.env.trace import STATUS_CODE
+from deepracer_exp.env.trace_columns import STATUS_CODE
 from deepracer_exp.evaluation.evaluator import Evaluator
 
 from .fresh import TRIALS, driven, fresh_trials

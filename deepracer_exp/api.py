@@ -13,9 +13,9 @@ from tensordict.nn import TensorDictModuleBase
 from deepracer_exp.config.compose import Composition, compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.stored import request_evaluation
+from deepracer_exp.env.others.rival import refuse_rivals
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.race_env import RaceEnv
-from deepracer_exp.env.rival import refuse_rivals
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.evaluation.evaluate import evaluate_run
 from deepracer_exp.evaluation.plan import plan_evaluation

@@ -44,7 +44,7 @@ VALUES = {"factor": 0.5, "friction": 1.0, "shares": (1.0, 1.0), "limits": [9.0]}
 
 def driven(package: Path, **variables: str) -> tuple[float, int]:
     """Drive in a new process and return the speed, and how many signatures were taken from the disk."""
-    code = "from deepracer_exp.sim.car import drive; print(drive(8.0), sum(drive.stats.cache_hits.values()))"
+    code = "from deepracer_exp.sim.mujoco_model import drive; print(drive(8.0), sum(drive.stats.cache_hits.values()))"
     made = subprocess.run(
         [sys.executable, "-c", code],
         cwd=package.parent,

@@ -18,7 +18,7 @@ from torchrl.collectors import MultiSyncCollector
 
 from deepracer_exp.config.learning import AlgorithmConfig
 from deepracer_exp.config.running import CollectorConfig
-from deepracer_exp.env.head_to_head import Rivals, Weights, weights_of
+from deepracer_exp.env.others.head_to_head import Rivals, Weights, weights_of
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import BadInput, RunFailed, count
 from deepracer_exp.patience import wait_patiently

@@ -14,10 +14,10 @@ from torchrl.collectors import Collector
 from torchrl.data import Unbounded
 from torchrl.envs.utils import set_exploration_type
 
-from deepracer_exp.env.head_to_head import HeadToHead, Rivals, Weights
+from deepracer_exp.env.others.head_to_head import HeadToHead, Rivals, Weights
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.race_env import RaceEnv
-from deepracer_exp.env.randomization import CarStreams, Purpose, StepNoise
+from deepracer_exp.env.randomization.car_randomization import CarStreams, Purpose, StepNoise
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.lifeline import end_with_owner

@@ -22,14 +22,14 @@ from numpy.typing import NDArray
 
 from deepracer_exp.aws.worlds.catalogue import worlds
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.env.others.rival import refuse_rivals
 from deepracer_exp.errors import BadInput
-from deepracer_exp.sim.lidar import FURTHEST_M
+from deepracer_exp.sim.lidar_rays import FURTHEST_M
 
 from .race import Race
-from .rival import refuse_rivals
 from .setup import RaceSetup, build_setup, deal
 from .top_view import TopView
-from .trace import EPISODE_STATUS, PACKED
+from .trace_columns import EPISODE_STATUS, PACKED
 
 Observed = Any
 """An array, or with two sensors a dictionary of arrays."""

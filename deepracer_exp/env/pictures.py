@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.driving import CameraConfig
 from deepracer_exp.config.track import FloorConfig
+from deepracer_exp.env.randomization.car_randomization import Ids
+from deepracer_exp.env.randomization.picture_randomization import PictureRandomization
 from deepracer_exp.sim.batch import CarState, cores
 from deepracer_exp.sim.camera import take_pictures
 from deepracer_exp.sim.lens import Lens
 from deepracer_exp.sim.scenery import MATERIALS, build_scenery, join_sceneries
 from deepracer_exp.tracks.track import Track
 
-from .picture_randomization import PictureRandomization
-from .randomization import Ids
 from .real_car import AS_SIMULATED, FRAME_SCALE, car_pictures
 
 GREY = np.array([0.299, 0.587, 0.114], np.float32)

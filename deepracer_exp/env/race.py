@@ -7,6 +7,11 @@ from typing import Any
 import numpy as np
 
 from deepracer_exp.config.driving import RandomizationConfig
+from deepracer_exp.env.others.race_others import RaceOthers
+from deepracer_exp.env.others.rival import RaceRival
+from deepracer_exp.env.randomization.car_randomization import Randomization, of_each_car
+from deepracer_exp.env.randomization.picture_randomization import PictureRandomization
+from deepracer_exp.env.randomization.real_car_randomization import RealCarRandomization
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.rewards.prints import RewardPrints
 from deepracer_exp.rewards.reward import RewardFunction
@@ -14,19 +19,14 @@ from deepracer_exp.sim.batch import CarBatch
 from deepracer_exp.tracks.lanes import INNER, OUTER, Lanes
 from deepracer_exp.tracks.track import Pose
 
-from .lidar import Lidar
+from .lidar_view import Lidar
 from .observation import Features
-from .others import RaceOthers
-from .picture_randomization import PictureRandomization
 from .pictures import Pictures
-from .randomization import Randomization, of_each_car
 from .real_car import Servos
-from .real_car_randomization import RealCarRandomization
-from .rival import RaceRival
 from .rules import RaceRules, StepResult
 from .setup import RaceSetup
 from .state import Measures, checked_array
-from .trace import OTHERS_PACKED, PACKED, RIVAL_PACKED
+from .trace_columns import OTHERS_PACKED, PACKED, RIVAL_PACKED
 from .trace_rows import Driven, Lengths, row_dtype, write_rows
 
 _KEPT = (

@@ -9,7 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from deepracer_exp.sim.lidar import FURTHEST_M
+from deepracer_exp.sim.lidar_rays import FURTHEST_M
 
 from .race import Race
 

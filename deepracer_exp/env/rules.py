@@ -26,7 +26,7 @@ from .rule_passes import (
 )
 from .setup import RaceSetup, courses_of_cars
 from .state import Floats, Measures, checked_array
-from .trace import STATUS_CODE
+from .trace_columns import STATUS_CODE
 
 Ids = NDArray[np.intp]
 Bools = NDArray[np.bool_]

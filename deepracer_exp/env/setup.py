@@ -13,14 +13,14 @@ from deepracer_exp.config.driving import EpisodeConfig, ObservationConfig, Rando
 from deepracer_exp.config.evaluation import RealCarConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.race import RaceConfig
+from deepracer_exp.env.others.boxes_and_bots import check_room
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.source import RewardSource, load_reward_source
-from deepracer_exp.sim.others import check_room
 from deepracer_exp.tracks.track import Track, directed_tracks
 
 from .action_space import ActionSpace, build_action_space
-from .files import RaceFiles
 from .observation import ObservationPart, build_parts
+from .race_files import RaceFiles
 
 
 @dataclass(frozen=True, kw_only=True)

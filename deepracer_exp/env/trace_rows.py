@@ -9,7 +9,7 @@ import numpy as np
 from deepracer_exp.compiled import compiled
 
 from .rule_passes import nearer_of
-from .trace import PACKED_COLUMNS, RANDOMIZED
+from .trace_columns import PACKED_COLUMNS, RANDOMIZED
 
 
 def row_dtype(extra: Sequence[str] = ()) -> np.dtype[np.void]:

@@ -18,7 +18,7 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.named import tracks_of
 from deepracer_exp.config.running import MLflowTracking
 from deepracer_exp.env.action_space import build_action_space, metadata_of
-from deepracer_exp.env.head_to_head import HeadToHead
+from deepracer_exp.env.others.head_to_head import HeadToHead
 from deepracer_exp.env.race import Race
 from deepracer_exp.errors import RunFailed, count, writing
 from deepracer_exp.files import atomic_write

@@ -15,11 +15,11 @@ from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.named import conditions_of, race_of, tracks_of
 from deepracer_exp.config.track import TrackConfig
-from deepracer_exp.env.head_to_head import HeadToHead, rival_setup
+from deepracer_exp.env.others.head_to_head import HeadToHead, rival_setup
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.real_car import as_the_car, require_car
 from deepracer_exp.env.setup import Course, build_setup
-from deepracer_exp.env.trace import PACKED, STATUS_CODE
+from deepracer_exp.env.trace_columns import PACKED, STATUS_CODE
 from deepracer_exp.rewards.source import NO_REWARD
 from deepracer_exp.runs.stored_run import StoredRun
 from deepracer_exp.tracks.track import directed_tracks

@@ -16,7 +16,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from deepracer_exp.env.race import Race
-from deepracer_exp.env.trace import PACKED, STATUS_CODE
+from deepracer_exp.env.trace_columns import PACKED, STATUS_CODE
 from deepracer_exp.errors import RunFailed, writing
 from deepracer_exp.sim.scenery import box_corners
 from deepracer_exp.tracks.track import Track

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepracer_exp.config.evaluation import EvaluationConfig
-from deepracer_exp.env.head_to_head import HeadToHead
-from deepracer_exp.env.trace import PACKED
+from deepracer_exp.env.others.head_to_head import HeadToHead
+from deepracer_exp.env.trace_columns import PACKED
 
 from .race_protocol import Attempt, RaceProtocol
 

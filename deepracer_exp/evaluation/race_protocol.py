@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.env.rules import lap_clock_s
-from deepracer_exp.env.trace import EPISODE_STATUS, STATUS_CODE
+from deepracer_exp.env.trace_columns import EPISODE_STATUS, STATUS_CODE
 
 Floats = NDArray[np.float64]
 Ids = NDArray[np.intp]

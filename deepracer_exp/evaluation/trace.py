@@ -9,9 +9,9 @@ from tensordict import TensorDict
 
 from deepracer_exp.aws.logs.sim_trace import write_trace
 from deepracer_exp.config.evaluation import EvaluationConfig
-from deepracer_exp.env.placement import placements_table
+from deepracer_exp.env.others.placement import placements_table
 from deepracer_exp.env.race import Race
-from deepracer_exp.env.trace import EPISODE_STATUS, PACKED, STATUS_CODE, to_table
+from deepracer_exp.env.trace_columns import EPISODE_STATUS, PACKED, STATUS_CODE, to_table
 from deepracer_exp.errors import RunFailed, writing
 from deepracer_exp.runs.trace import write_evaluation_others
 

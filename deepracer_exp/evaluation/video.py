@@ -11,7 +11,7 @@ from rich.console import Console
 
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.sim import mujoco
-from deepracer_exp.sim.car import STEERED, WHEELS, build_spec
+from deepracer_exp.sim.mujoco_model import STEERED, WHEELS, build_spec
 from deepracer_exp.tracks.outline import draw_track, extent
 from deepracer_exp.tracks.track import Track
 

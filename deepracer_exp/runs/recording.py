@@ -30,8 +30,8 @@ from deepracer_exp.config.custom_files import SAC_TAKEN, TAKEN
 from deepracer_exp.config.driving import OFF, ActionSpaceConfig
 from deepracer_exp.config.race import RaceConfig
 from deepracer_exp.env.action_space import build_action_space, metadata_of
-from deepracer_exp.env.placement import PlacedOthers, read_placements
-from deepracer_exp.env.trace import EPISODE_STATUS, SCHEMA
+from deepracer_exp.env.others.placement import PlacedOthers, read_placements
+from deepracer_exp.env.trace_columns import EPISODE_STATUS, SCHEMA
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import RECORD_BYTES, read_text
 

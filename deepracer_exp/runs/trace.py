@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from deepracer_exp.config.race import RaceConfig
-from deepracer_exp.env.placement import SCHEMA as OTHERS_SCHEMA
-from deepracer_exp.env.placement import PlacedOthers, read_placements
-from deepracer_exp.env.trace import SCHEMA, TRACE_COLUMNS
+from deepracer_exp.env.others.placement import SCHEMA as OTHERS_SCHEMA
+from deepracer_exp.env.others.placement import PlacedOthers, read_placements
+from deepracer_exp.env.trace_columns import SCHEMA, TRACE_COLUMNS
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.files import LOG_BYTES, plain_file
 

@@ -14,7 +14,7 @@ from deepracer_exp.compiled import cfunc, njit
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.errors import RunFailed
 
-from .car import build_spec
+from .mujoco_model import build_spec
 from .tyres import DRIVE, Clock, car_record, push_cars
 
 Floats = NDArray[np.float64]

@@ -10,7 +10,7 @@ import numpy as np
 from deepracer_exp.config.stopping import ReliableStopping, StoppingConfig
 from deepracer_exp.env.rules import lap_clock_s
 from deepracer_exp.env.setup import RaceSetup
-from deepracer_exp.env.trace import PACKED, STATUS_CODE
+from deepracer_exp.env.trace_columns import PACKED, STATUS_CODE
 from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, zigzag_columns
 from deepracer_exp.runs.fingerprint import REMEMBERED_EPISODES
 from deepracer_exp.tracking.metrics import track_labels, track_metric

@@ -9,7 +9,7 @@ from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.parse import import_own_classes, parse_experiment
 from deepracer_exp.config.stored import with_overrides
-from deepracer_exp.env.files import RaceFiles, read_race_files
+from deepracer_exp.env.race_files import RaceFiles, read_race_files
 from deepracer_exp.env.real_car import require_car
 from deepracer_exp.evaluation.rival_run import find_rival
 from deepracer_exp.runs.run_files import PROVENANCE, read_config, read_object

@@ -21,9 +21,9 @@ from deepracer_exp.agents.build import build_agent, build_networks
 from deepracer_exp.collectors.collector import Collector, open_collector
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.observation import observation_shape
-from deepracer_exp.env.placement import placements_table
+from deepracer_exp.env.others.placement import placements_table
 from deepracer_exp.env.setup import RaceSetup
-from deepracer_exp.env.trace import PACKED, to_table
+from deepracer_exp.env.trace_columns import PACKED, to_table
 from deepracer_exp.errors import RunFailed, reading
 from deepracer_exp.evaluation.result import Evaluation
 from deepracer_exp.evaluation.rival_run import kept_rival

@@ -9,7 +9,7 @@ import pytest
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.setup import RaceSetup, build_setup
-from deepracer_exp.env.trace import PACKED
+from deepracer_exp.env.trace_columns import PACKED
 
 
 @cache

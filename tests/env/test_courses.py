@@ -8,7 +8,7 @@ import pytest
 from deepracer_exp.env.gym_env import DeepRacerEnv, DeepRacerVectorEnv
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.setup import courses_of_cars
-from deepracer_exp.env.trace import PACKED
+from deepracer_exp.env.trace_columns import PACKED
 from deepracer_exp.errors import BadInput
 from tests.env.conftest import drive, spied
 

@@ -14,7 +14,7 @@ from benchmarks.all_tracks import TRACKS
 from deepracer_exp.aws.worlds.catalogue import worlds
 from deepracer_exp.env.gym_env import DeepRacerEnv, DeepRacerVectorEnv
 from deepracer_exp.env.sb3 import DeepRacerVecEnv
-from deepracer_exp.env.trace import EPISODE_STATUS
+from deepracer_exp.env.trace_columns import EPISODE_STATUS
 from deepracer_exp.errors import BadInput
 
 SPACES = ["action_space=discrete", "action_space=continuous"]

@@ -6,9 +6,9 @@ import pytest
 import shapely
 
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.env.lidar import reach_of_rays, readings
+from deepracer_exp.env.lidar_view import reach_of_rays, readings
 from deepracer_exp.env.race import Race
-from deepracer_exp.sim.lidar import ANGLES_RAD, MOUNT_X_M, MOUNT_Z_M
+from deepracer_exp.sim.lidar_rays import ANGLES_RAD, MOUNT_X_M, MOUNT_Z_M
 from deepracer_exp.sim.scenery import box_corners
 from tests.env.conftest import drive_and_see
 

@@ -3,13 +3,13 @@ import hashlib
 
 import numpy as np
 import pytest
+from deepracer_exp.env.others.collisions import BOX_M
+from deepracer_exp.env.others.race_others import NEAR_M, with_crashes
 
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.env.others import NEAR_M, with_crashes
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.setup import build_setup
-from deepracer_exp.env.trace import EPISODE_STATUS, PACKED, STATUS_CODE
-from deepracer_exp.sim.collisions import BOX_M
+from deepracer_exp.env.trace_columns import EPISODE_STATUS, PACKED, STATUS_CODE
 from tests.conftest import refused
 from tests.env.conftest import drive, make_setup, random_actions, spied
 

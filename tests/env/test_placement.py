@@ -4,11 +4,16 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import torch
+from deepracer_exp.env.others.head_to_head import HeadToHead, rival_setup
+from deepracer_exp.env.others.placement import (
+    SCHEMA,
+    placements_table,
+    read_placements,
+    rebuild_poses,
+)
 
-from deepracer_exp.env.head_to_head import HeadToHead, rival_setup
-from deepracer_exp.env.placement import SCHEMA, placements_table, read_placements, rebuild_poses
 from deepracer_exp.env.race import Race
-from deepracer_exp.env.trace import PACKED
+from deepracer_exp.env.trace_columns import PACKED
 from tests.env.conftest import make_setup, random_actions
 
 STANDING = ("action_space=continuous", "action_space.speed.low=0", "episode.immobilized_steps=0")

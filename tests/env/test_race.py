@@ -3,7 +3,7 @@ import pytest
 import shapely
 
 from deepracer_exp.env.race import NonFinite
-from deepracer_exp.env.trace import PACKED, STATUS_CODE
+from deepracer_exp.env.trace_columns import PACKED, STATUS_CODE
 from tests.env.conftest import drive, random_actions, spied
 from tests.rewards.test_reward import KEYS
 

@@ -7,7 +7,7 @@ from torchrl.envs.utils import check_env_specs
 
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.race_env import RaceEnv
-from deepracer_exp.env.trace import PACKED
+from deepracer_exp.env.trace_columns import PACKED
 
 SPACES = ["action_space=discrete", "action_space=continuous"]
 

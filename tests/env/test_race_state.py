@@ -6,7 +6,7 @@ import pytest
 
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.rules import EpisodeRules
-from deepracer_exp.env.trace import STATUS_CODE
+from deepracer_exp.env.trace_columns import STATUS_CODE
 from tests.conftest import refused
 from tests.env.conftest import make_setup
 

@@ -20,7 +20,7 @@ from deepracer_exp.env.action_space import ContinuousActions, DiscreteActions
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.real_car import UNCOMPRESSED, Servos, as_the_car, car_pictures, car_refusals
 from deepracer_exp.env.setup import build_setup
-from deepracer_exp.env.trace import PACKED
+from deepracer_exp.env.trace_columns import PACKED
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from deepracer_exp.config.evaluation import (
 )
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.real_car import as_the_car
-from deepracer_exp.env.trace import PACKED
+from deepracer_exp.env.trace_columns import PACKED
 from deepracer_exp.errors import BadInput
 from tests.env.conftest import drive, make_setup, random_actions
 

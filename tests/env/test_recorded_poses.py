@@ -9,7 +9,7 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.rule_passes import nearer_of
 from deepracer_exp.env.rules import RaceRules
 from deepracer_exp.env.setup import build_setup
-from deepracer_exp.env.trace import EPISODE_STATUS
+from deepracer_exp.env.trace_columns import EPISODE_STATUS
 from deepracer_exp.rewards.reward import RewardFunction
 from deepracer_exp.rewards.source import RewardSource
 from deepracer_exp.sim.batch import CarState

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from deepracer_exp.config.driving import EpisodeConfig
 from deepracer_exp.env.rules import EpisodeRules
-from deepracer_exp.env.trace import EPISODE_STATUS
+from deepracer_exp.env.trace_columns import EPISODE_STATUS
 
 CONFIG = EpisodeConfig(
     start_offset=0.0,

@@ -2,8 +2,7 @@ import itertools
 
 import numpy as np
 import pytest
-
-from deepracer_exp.env.randomization import CarStreams, Purpose, StepNoise
+from deepracer_exp.env.randomization.car_randomization import CarStreams, Purpose, StepNoise
 
 
 def noise(seed: int, cars, width: int = 2) -> StepNoise:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from deepracer_exp.env.trace import (
+from deepracer_exp.env.trace_columns import (
     EPISODE_STATUS,
     PACKED,
     PACKED_COLUMNS,

@@ -8,7 +8,7 @@ import torch
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.setup import build_setup
-from deepracer_exp.env.trace import PACKED, STATUS_CODE
+from deepracer_exp.env.trace_columns import PACKED, STATUS_CODE
 from deepracer_exp.evaluation.evaluator import Evaluator
 from tests.conftest import refused
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from deepracer_exp.env.trace import STATUS_CODE
+from deepracer_exp.env.trace_columns import STATUS_CODE
 from deepracer_exp.evaluation.race_protocol import RaceProtocol
 
 STEP_S = 0.5

@@ -37,7 +37,7 @@ from deepracer_exp.reports.pages.sight import picture_of, saliency
 from deepracer_exp.reports.pages.watch import HEIGHT, WIDTH, Frames, rays
 from deepracer_exp.runs.run_files import read_metrics
 from deepracer_exp.runs.stored_run import StoredRun
-from deepracer_exp.sim.lidar import MOUNT_X_M
+from deepracer_exp.sim.lidar_rays import MOUNT_X_M
 from deepracer_exp.sim.scenery import wall_ring
 from deepracer_exp.tracks.track import Track
 from tests.browser import needs_chromium

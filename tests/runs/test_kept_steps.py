@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.env.trace import PACKED_COLUMNS, STATUS_CODE, to_table
+from deepracer_exp.env.trace_columns import PACKED_COLUMNS, STATUS_CODE, to_table
 from deepracer_exp.errors import BadInput
 from deepracer_exp.reports.findings import findings
 from deepracer_exp.reports.pages.log_report import LogPage, draw_sections

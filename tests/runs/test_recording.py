@@ -13,7 +13,7 @@ import yaml
 from deepracer_exp.aws.logs.recorded import METRICS_COLUMNS, STEP_COLUMNS, UPDATE_COLUMNS
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.action_space import build_action_space, metadata_of
-from deepracer_exp.env.trace import SCHEMA
+from deepracer_exp.env.trace_columns import SCHEMA
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.recording import EVALUATION_COLUMNS, is_traced_run, read_run_recording
 from deepracer_exp.runs.trace import read_trace

@@ -7,7 +7,7 @@ from pydantic import TypeAdapter, ValidationError
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.options import options
-from deepracer_exp.sim.car import build_spec
+from deepracer_exp.sim.mujoco_model import build_spec
 
 
 @pytest.fixture(params=options("car"))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import shapely
 
-from deepracer_exp.sim.lidar import ANGLES_RAD, MOUNT_Z_M, RAYS, box_sides, scan
+from deepracer_exp.sim.lidar_rays import ANGLES_RAD, MOUNT_Z_M, RAYS, box_sides, scan
 
 
 def sides(low_x: float, low_y: float, high_x: float, high_y: float) -> np.ndarray:

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepracer_exp.config.stopping import NoStopping, ReliableStopping
-from deepracer_exp.env.trace import PACKED, STATUS_CODE
+from deepracer_exp.env.trace_columns import PACKED, STATUS_CODE
 from deepracer_exp.training.metrics import Finished, Ranking, RunMetrics
 from deepracer_exp.training.stopping.stopping_rules import build_rule
 

@@ -22,7 +22,7 @@ from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.action_space import ActionSpace
 from deepracer_exp.env.race import Race
-from deepracer_exp.env.trace import PACKED, STATUS_CODE
+from deepracer_exp.env.trace_columns import PACKED, STATUS_CODE
 from deepracer_exp.errors import RunFailed, writing
 from deepracer_exp.evaluation.evaluate import (
     CAR,

@@ -170,7 +170,7 @@ def _rescaled(tensors: Tensors, rescaling: Rescaling) -> Tensors:
 
 def _lidar_config(lidar: LidarConfig) -> dict[str, float]:
     """Return the keys of the car's own `lidar_config`, all of which it needs; they differ from the simulator's."""
-    from deepracer_exp.sim.lidar import ANGLES_RAD, NEAREST_M, RAYS
+    from deepracer_exp.sim.lidar_rays import ANGLES_RAD, NEAREST_M, RAYS
 
     angle_deg = round(float(np.degrees(ANGLES_RAD[-1])), 1)
     return {

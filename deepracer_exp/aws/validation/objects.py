@@ -7,14 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepracer_exp.config.race import ALONE, BoxPosition
-from deepracer_exp.env.others import RaceOthers
-from deepracer_exp.env.placement import Placement, draw_placements
-from deepracer_exp.env.randomization import CarStreams, Purpose
+from deepracer_exp.env.others.boxes_and_bots import Others
+from deepracer_exp.env.others.placement import Placement, draw_placements
+from deepracer_exp.env.others.race_others import RaceOthers
+from deepracer_exp.env.others.service_draws import episode_seeds
+from deepracer_exp.env.randomization.car_randomization import CarStreams, Purpose
 from deepracer_exp.env.rules import RaceRules, StepResult
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.rewards.params import OBJECT_COLUMNS
-from deepracer_exp.sim.others import Others
-from deepracer_exp.sim.placement import episode_seeds
 from deepracer_exp.sim.scenery import box_corners
 from deepracer_exp.tracks.lanes import Lanes
 from deepracer_exp.tracks.track import Tracks

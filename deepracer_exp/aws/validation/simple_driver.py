@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from deepracer_exp.env.others import RaceOthers
+from deepracer_exp.env.others.race_others import RaceOthers
 from deepracer_exp.env.rules import RaceRules, lap_clock_s
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.env.state import Measures
-from deepracer_exp.env.trace import STATUS_CODE
+from deepracer_exp.env.trace_columns import STATUS_CODE
 from deepracer_exp.rewards.params import BATCH_COLUMNS, MASK, OBJECT_COLUMNS
 from deepracer_exp.sim.batch import CarBatch
 from deepracer_exp.tracks.track import Track

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from deepracer_exp.env.action_space import ContinuousActions
-from deepracer_exp.env.placement import Placement
+from deepracer_exp.env.others.placement import Placement
 from deepracer_exp.env.rules import RaceRules
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.rewards.params import TrackParams, row_keys, rows, scalar_params, select

@@ -17,7 +17,7 @@ from rich.text import Text
 from deepracer_exp.aws.worlds.catalogue import UNITS_PER_M
 from deepracer_exp.aws.worlds.routes import recognise
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.env.files import RaceFiles
+from deepracer_exp.env.race_files import RaceFiles
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.errors import BadInput, count, writing
 from deepracer_exp.rewards.reward import RewardFailed

@@ -23,7 +23,7 @@ from deepracer_exp.config.named import no_randomization
 from deepracer_exp.env.action_space import ContinuousActions, build_action_space
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.setup import Course, build_setup
-from deepracer_exp.env.trace import PACKED, STATUS_CODE
+from deepracer_exp.env.trace_columns import PACKED, STATUS_CODE
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.files import atomic_write, read_json
 from deepracer_exp.rewards.source import NO_REWARD

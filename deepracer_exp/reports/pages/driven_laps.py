@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from deepracer_exp.config.evaluation import EvaluationConfig
-from deepracer_exp.env.trace import PACKED, STATUS_CODE
+from deepracer_exp.env.trace_columns import PACKED, STATUS_CODE
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.film import LapRecorder, best_attempt

@@ -11,7 +11,7 @@ from pydantic import TypeAdapter
 
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.race import RaceConfig
-from deepracer_exp.env.placement import box_corners_of, read_placements
+from deepracer_exp.env.others.placement import box_corners_of, read_placements
 from deepracer_exp.env.setup import Course
 from deepracer_exp.runs.next_steps import COMMAND, own_word
 from deepracer_exp.runs.run_files import BEST_LAP, LEARNING, METRICS, REPORT, TRACE, read_config

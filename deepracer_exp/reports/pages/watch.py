@@ -18,7 +18,7 @@ from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.driving import CameraConfig, LidarConfig, ObservationConfig
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.env.action_space import ActionSpace, DiscreteActions
-from deepracer_exp.env.lidar import reach_of_rays
+from deepracer_exp.env.lidar_view import reach_of_rays
 from deepracer_exp.errors import RunFailed, count, writing
 from deepracer_exp.evaluation.evaluator import evaluator_against
 from deepracer_exp.evaluation.film import Lap, drive_best_lap, in_frames, write_film
@@ -26,7 +26,7 @@ from deepracer_exp.reports.charts.run_pictures import SPEED
 from deepracer_exp.runs.checkpoint_files import checkpoint_words
 from deepracer_exp.runs.run_files import FILMS
 from deepracer_exp.runs.stored_run import StoredRun
-from deepracer_exp.sim.lidar import ANGLES_RAD, MOUNT_X_M
+from deepracer_exp.sim.lidar_rays import ANGLES_RAD, MOUNT_X_M
 from deepracer_exp.sim.scenery import box_corners
 from deepracer_exp.tracks.outline import draw_track, extent
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from deepracer_exp.aws.logs.recorded import TRAINING, LogProblem, Recording
 from deepracer_exp.aws.models.hyperparameters import Hyperparameters
-from deepracer_exp.env.placement import PlacedOthers, box_corners_of, rebuild_poses
+from deepracer_exp.env.others.placement import PlacedOthers, box_corners_of, rebuild_poses
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.recording import EvaluationRecording, RunRecording
 from deepracer_exp.runs.run_files import METRICS

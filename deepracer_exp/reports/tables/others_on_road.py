@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from deepracer_exp.aws.logs.recorded import Recording
 from deepracer_exp.config.job_race import recorded_race
-from deepracer_exp.env.placement import (
+from deepracer_exp.env.others.collisions import BOX_M, CAR_M, first_hit
+from deepracer_exp.env.others.placement import (
     PlacedOthers,
     Placement,
     box_corners_of,
@@ -17,7 +18,6 @@ from deepracer_exp.env.placement import (
 )
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.recording import CONTROL_PERIOD_S
-from deepracer_exp.sim.collisions import BOX_M, CAR_M, first_hit
 from deepracer_exp.tracks.track import Track
 
 from .statistics import Values, wilson

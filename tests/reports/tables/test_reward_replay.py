@@ -9,7 +9,7 @@ import pytest
 from deepracer_exp.aws.logs.recorded import STEP_COLUMNS
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.parse import parse_experiment
-from deepracer_exp.env.trace import SCHEMA
+from deepracer_exp.env.trace_columns import SCHEMA
 from deepracer_exp.errors import BadInput
 from deepracer_exp.reports.tables import reward_replay
 from deepracer_exp.reports.tables.log_view import LogView, prepare

@@ -12,17 +12,17 @@ from torch.distributions import Categorical
 
 from deepracer_exp.config.driving import ObservationConfig, RandomizationConfig
 from deepracer_exp.config.race import RivalsConfig
+from deepracer_exp.env.observation import build_parts
+from deepracer_exp.env.race import Race
+from deepracer_exp.env.randomization.car_randomization import CarStreams, Purpose
+from deepracer_exp.env.rules import Bools, Floats, Ids
+from deepracer_exp.env.setup import RaceSetup
+from deepracer_exp.env.state import checked_array
+from deepracer_exp.env.trace_columns import PACKED, STATUS_CODE
 from deepracer_exp.rewards.prints import RewardPrints
 from deepracer_exp.rewards.source import NO_REWARD
 
-from .observation import build_parts
-from .race import Race
-from .randomization import CarStreams, Purpose
 from .rival import RaceRival
-from .rules import Bools, Floats, Ids
-from .setup import RaceSetup
-from .state import checked_array
-from .trace import PACKED, STATUS_CODE
 
 Weights = Mapping[str, np.ndarray]
 """Tensors of a policy by name, as NumPy arrays, which processes and checkpoints exchange without PyTorch's pickle."""

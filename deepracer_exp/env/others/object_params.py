@@ -5,11 +5,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from deepracer_exp.sim.nearby import closest
-from deepracer_exp.sim.others import Others
+from deepracer_exp.env.rules import Bools, RaceRules
+from deepracer_exp.env.state import Floats, Measures
 
-from .rules import Bools, RaceRules
-from .state import Floats, Measures
+from .boxes_and_bots import Others
+from .nearby import closest
 
 _VIEW = np.tan(0.5 * 1.13)
 """Tangent of half the horizontal angle of view, of which 480/640 is visible vertically (deepracer-simapp,

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepracer_exp.config.driving import OFF, QUANTITIES, RandomizationConfig
+from deepracer_exp.env.state import checked_array
 from deepracer_exp.sim.batch import CarBatch
-
-from .state import checked_array
 
 Floats = NDArray[np.float64]
 Ids = NDArray[np.intp]

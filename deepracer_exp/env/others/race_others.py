@@ -8,19 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepracer_exp.config.race import RaceConfig
-from deepracer_exp.sim.nearby import Around, Here, Reach, next_ones
-from deepracer_exp.sim.others import Others
-from deepracer_exp.sim.placement import episode_seeds
+from deepracer_exp.env.randomization.car_randomization import CarStreams, Purpose
+from deepracer_exp.env.rules import Bools, Ids, RaceRules, StepResult, lap_clock_s
+from deepracer_exp.env.setup import RaceSetup
+from deepracer_exp.env.state import Floats, Measures, checked_array
+from deepracer_exp.env.trace_columns import STATUS_CODE
 from deepracer_exp.tracks.lanes import INNER, OUTER, Lanes
 from deepracer_exp.tracks.track import Pose
 
+from .boxes_and_bots import Others
+from .nearby import Around, Here, Reach, next_ones
 from .object_params import ObjectParams
 from .placement import draw_placements
-from .randomization import CarStreams, Purpose
-from .rules import Bools, Ids, RaceRules, StepResult, lap_clock_s
-from .setup import RaceSetup
-from .state import Floats, Measures, checked_array
-from .trace import STATUS_CODE
+from .service_draws import episode_seeds
 
 NEAR_M = 1.0
 """Distance along the lap within which a car that would start near a box or bot starts in the other lane."""

@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepracer_exp.config.driving import LidarConfig
+from deepracer_exp.env.randomization.car_randomization import CarStreams, Ids, Purpose
 from deepracer_exp.sim.batch import CarState
-from deepracer_exp.sim.lidar import (
+from deepracer_exp.sim.lidar_rays import (
     FURTHEST_M,
     MOUNT_X_M,
     MOUNT_Z_M,
@@ -19,8 +20,6 @@ from deepracer_exp.sim.lidar import (
 )
 from deepracer_exp.sim.scenery import wall_ring
 from deepracer_exp.tracks.track import Track
-
-from .randomization import CarStreams, Ids, Purpose
 
 _NOISE_NUMBERS = 2**16
 """Standard normal numbers that all scans take their noise from: drawing new ones would take longer than the scan."""

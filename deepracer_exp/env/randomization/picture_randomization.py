@@ -12,7 +12,7 @@ from deepracer_exp.config.driving import PictureRandomizationConfig
 from deepracer_exp.sim.scenery import MATERIALS, paved_area, wall_ring
 from deepracer_exp.tracks.track import Track
 
-from .randomization import CarStreams, Ids, Purpose
+from .car_randomization import CarStreams, Ids, Purpose
 
 QUANTITIES = tuple(field.name for field in fields(PictureRandomizationConfig))
 _COLUMN = {name: column for column, name in enumerate(QUANTITIES)}

@@ -7,16 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepracer_exp.config.race import RaceConfig
+from deepracer_exp.env.rules import Bools, Ids, RaceRules
+from deepracer_exp.env.setup import RaceSetup
+from deepracer_exp.env.state import Floats
 from deepracer_exp.errors import BadInput
 from deepracer_exp.sim.batch import CarState
-from deepracer_exp.sim.others import Others
 from deepracer_exp.tracks.lanes import INNER, OUTER, Lanes
 from deepracer_exp.tracks.track import Pose, Tracks
 
-from .others import RaceOthers, around
-from .rules import Bools, Ids, RaceRules
-from .setup import RaceSetup
-from .state import Floats
+from .boxes_and_bots import Others
+from .race_others import RaceOthers, around
 
 _KEPT = ("speed_mps", "untouchable")
 

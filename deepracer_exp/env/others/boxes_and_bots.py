@@ -18,7 +18,7 @@ from deepracer_exp.tracks.track import Track, TrackIndex, Tracks
 
 from .bots import Bots, Manner, drive
 from .collisions import BOX_M, CAR_M, first_hit
-from .placement import END_M
+from .service_draws import END_M
 
 _ROUNDING_S = 1e-9
 

@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from deepracer_exp.config.driving import CarRandomizationConfig
 from deepracer_exp.config.evaluation import RealCarConfig
+from deepracer_exp.env.real_car import AS_SIMULATED, UNCOMPRESSED, split_delay
 from deepracer_exp.sim.batch import CarBatch
 
-from .randomization import CarStreams, Ids, Purpose
-from .real_car import AS_SIMULATED, UNCOMPRESSED, split_delay
+from .car_randomization import CarStreams, Ids, Purpose
 
 Floats = NDArray[np.float64]
 

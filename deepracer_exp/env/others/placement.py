@@ -9,17 +9,17 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from deepracer_exp.config.race import LANES, RaceConfig
-from deepracer_exp.sim.collisions import BOX_M
-from deepracer_exp.sim.others import Others
-from deepracer_exp.sim.placement import episode_seeds, place
+from deepracer_exp.env.randomization.car_randomization import CarStreams, Purpose
+from deepracer_exp.env.rules import lap_clock_s
+from deepracer_exp.env.setup import RaceSetup
+from deepracer_exp.env.trace_columns import OTHERS_PACKED, PACKED
 from deepracer_exp.sim.scenery import box_corners
 from deepracer_exp.tracks.lanes import Lanes
 from deepracer_exp.tracks.track import Track, Tracks
 
-from .randomization import CarStreams, Purpose
-from .rules import lap_clock_s
-from .setup import RaceSetup
-from .trace import OTHERS_PACKED, PACKED
+from .boxes_and_bots import Others
+from .collisions import BOX_M
+from .service_draws import episode_seeds, place
 
 Floats = NDArray[np.float64]
 

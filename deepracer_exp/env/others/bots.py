@@ -7,7 +7,7 @@ import numpy as np
 
 from deepracer_exp.compiled import njit
 
-from .placement import uniform
+from .service_draws import uniform
 
 _MOST_BOTS = 1000
 """Numbers of an episode's seed for each change of lanes, one for each bot."""
