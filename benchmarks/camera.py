@@ -28,13 +28,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from deepracer_exp.env.randomization.picture_randomization import PictureRandomization
 from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import distance_transform_edt
 
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.pictures import GREY, floor_colors
+from deepracer_exp.env.randomization.picture_randomization import PictureRandomization
 from deepracer_exp.errors import BadInput
 from deepracer_exp.sim.camera import take_pictures
 from deepracer_exp.sim.lens import Lens

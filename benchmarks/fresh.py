@@ -11,7 +11,7 @@ from deepracer_exp.config.compose import compose_evaluation
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation
+from deepracer_exp.evaluation.results import HELD_OUT, USUAL, Evaluation
 from deepracer_exp.runs.stored_run import StoredRun
 
 TRIALS = 64

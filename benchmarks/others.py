@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from deepracer_exp.env.others.race_others import RaceOthers
 
 from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.env.others.race_others import RaceOthers
 from deepracer_exp.env.rules import RaceRules
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.env.trace_columns import STATUS_CODE

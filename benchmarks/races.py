@@ -40,7 +40,7 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.evaluation.result import USUAL, TrialGroup
+from deepracer_exp.evaluation.results import USUAL, TrialGroup
 
 from .command import at_once, read_metrics, read_summary, trained
 from .fresh import protocol, stored_policy

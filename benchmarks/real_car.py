@@ -50,9 +50,9 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.errors import BadInput
-from deepracer_exp.evaluation.evaluate import CAR, SIMULATOR, car_protocols
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.evaluation.result import NOTHING, USUAL
+from deepracer_exp.evaluation.results import NOTHING, USUAL
+from deepracer_exp.evaluation.run_evaluation import CAR, SIMULATOR, car_protocols
 from deepracer_exp.runs.stored_run import StoredRun
 
 from .camera import read_frames

@@ -32,7 +32,7 @@ from deepracer_exp.env.setup import build_courses
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.fastest.fastest_lap import Question, fastest_lap
-from deepracer_exp.evaluation.result import USUAL
+from deepracer_exp.evaluation.results import USUAL
 from deepracer_exp.tracks.boards import boards_of
 
 from .all_tracks import TRACKS

@@ -11,7 +11,7 @@ from typing import Any
 from torchrl.checkpoint import Checkpoint
 
 from deepracer_exp.runs.trace import read_trace
-from deepracer_exp.tracking.metrics import BEST, MACHINE, metric_name
+from deepracer_exp.tracking.mlflow_metrics import BEST, MACHINE, metric_name
 from deepracer_exp.training.metrics import TIMES
 
 Row = Mapping[str, Any]

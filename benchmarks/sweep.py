@@ -50,8 +50,8 @@ from deepracer_exp.config.sweep import Pruner, compose_sweep
 from deepracer_exp.sweeps.fresh_laps import fresh
 from deepracer_exp.sweeps.queue.storage import open_storage
 from deepracer_exp.sweeps.queue.study import load_study
-from deepracer_exp.sweeps.report.best import best_trial
-from deepracer_exp.sweeps.report.labels import ending_of
+from deepracer_exp.sweeps.report.best_trial import best_trial
+from deepracer_exp.sweeps.report.wording import ending_of
 from deepracer_exp.sweeps.search.objectives import cost
 from deepracer_exp.sweeps.search.pruners import build_pruner
 from deepracer_exp.sweeps.trial import Trial

@@ -27,7 +27,7 @@ from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.sweep import SweepRequest
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.runs.run_files import MLFLOW, TRACKING, read_config, read_object
-from deepracer_exp.sweeps.report.labels import ending_of
+from deepracer_exp.sweeps.report.wording import ending_of
 from deepracer_exp.sweeps.search.objectives import intermediate_value, objective_values
 from deepracer_exp.sweeps.trial import Trial
 

@@ -4,7 +4,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from deepracer_exp.evaluation.results import Evaluation
     from deepracer_exp.training.stopping.stopping_rules import Decision, StoppingRule
+    from deepracer_exp.training.train_result import TrainResult
 
     from .agents.algorithm import Algorithm, UpdateMetrics
     from .agents.ppo import PPO
@@ -23,9 +25,7 @@ if TYPE_CHECKING:
     from .env.observation import ObservationPart
     from .env.race_env import RaceEnv
     from .errors import BadInput, RunFailed
-    from .evaluation.result import Evaluation
     from .tracking.tracker import Tracker
-    from .training.result import TrainResult
     from .training.trainer import Callback, Trainer
 
 __version__ = "0.1.0"

@@ -17,16 +17,16 @@ from deepracer_exp.env.others.rival import refuse_rivals
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.race_env import RaceEnv
 from deepracer_exp.env.setup import build_setup
-from deepracer_exp.evaluation.evaluate import evaluate_run
 from deepracer_exp.evaluation.plan import plan_evaluation
-from deepracer_exp.evaluation.result import Evaluation
+from deepracer_exp.evaluation.results import Evaluation
+from deepracer_exp.evaluation.run_evaluation import evaluate_run
 from deepracer_exp.reports.pages.run_page import RunReport
 from deepracer_exp.runs.recording import read_run_recording
 from deepracer_exp.runs.run_files import METRICS, SUMMARY, read_config, read_metrics, read_object
 from deepracer_exp.tracking.resolve import resolve
 from deepracer_exp.training.plan import plan_resume, plan_training
-from deepracer_exp.training.result import TrainResult
 from deepracer_exp.training.run import run_training
+from deepracer_exp.training.train_result import TrainResult
 from deepracer_exp.training.trainer import Callback
 
 

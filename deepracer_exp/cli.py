@@ -96,7 +96,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of all commands, in the order of `--help`."""
-    from deepracer_exp.commands import actions, analyze, compare, evaluate, files, runs, tracks, train
+    from deepracer_exp.commands import actions, analyze, compare, evaluate, exchange, runs, tracks, train
 
     parser: argparse.ArgumentParser = _Parser(
         prog="deepracer-exp",
@@ -106,7 +106,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"deepracer-exp {__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
-    for family in (train, runs, evaluate, analyze, compare, files, tracks, actions):
+    for family in (train, runs, evaluate, analyze, compare, exchange, tracks, actions):
         family.add_commands(commands)
     return parser
 

@@ -11,7 +11,7 @@ from pathlib import Path
 def test_the_fork_server_has_loaded_the_compiled_functions_of_its_workers():
     code = """
 import gc, json
-import deepracer_exp.collectors.worker
+import deepracer_exp.collectors.car_worker
 import deepracer_exp.collectors.fork_ready
 from deepracer_exp.tracks import segments
 print(json.dumps([bool(segments._candidates.signatures), gc.get_freeze_count()]))
@@ -80,7 +80,7 @@ def test_nothing_of_other_libraries_differs_from_a_process_without_this_package(
 def test_pytorch_compiles_and_numba_keeps_code_of_others_where_it_would_without_this_package(tmp_path):
     code = """
 import deepracer_exp.training.run
-import deepracer_exp.collectors.worker
+import deepracer_exp.collectors.car_worker
 import torch, users
 assert torch.compile(lambda x: 2 * x + 1, backend="eager")(torch.ones(1)) == 3.0
 assert users.doubled(2.0) == 4.0

@@ -18,8 +18,8 @@ from threadpoolctl import ThreadpoolController
 from torch import Tensor, nn
 from torchrl.modules import MLP, ProbabilisticActor
 
-from deepracer_exp.compiled import njit
 from deepracer_exp.config.learning import PPOConfig
+from deepracer_exp.jit import njit
 
 from .actor_critic import ActorCritic
 

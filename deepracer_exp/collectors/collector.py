@@ -26,9 +26,9 @@ from deepracer_exp.runs.crash_dump import read_crash_dump
 from deepracer_exp.runs.run_files import HEARTBEAT, LOG
 from deepracer_exp.sim.batch import cores
 
+from .car_worker import CarCollector, EnvFactory
 from .sampling import SamplingPolicy
 from .watchdog import Watchdog
-from .worker import CarCollector, EnvFactory
 
 _DEATH_S = 30.0
 """Longest wait, after a pipe to a worker broke, until the system reports the end of its process."""

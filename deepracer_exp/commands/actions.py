@@ -90,7 +90,10 @@ def _whole(text: str) -> int:
 
 def _actions(args: argparse.Namespace) -> int:
     from deepracer_exp.aws.models.model_metadata import model_metadata_text
-    from deepracer_exp.config.imported_options import check_action_space_name, write_action_space
+    from deepracer_exp.config.custom_files.imported_options import (
+        check_action_space_name,
+        write_action_space,
+    )
     from deepracer_exp.files import atomic_write
     from deepracer_exp.reports.tables.proposed_actions import check_count, propose_actions
 
@@ -136,7 +139,10 @@ def write_lap_actions(wanted: "LapActions") -> None:
         BadInput: a file cannot be written.
         RunFailed: no lap is possible.
     """
-    from deepracer_exp.config.imported_options import check_action_space_name, write_action_space
+    from deepracer_exp.config.custom_files.imported_options import (
+        check_action_space_name,
+        write_action_space,
+    )
     from deepracer_exp.config.options import options
     from deepracer_exp.reports.tables.proposed_actions import commands_of_fastest, propose_actions
 

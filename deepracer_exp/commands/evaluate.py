@@ -130,7 +130,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     if video is not None:
         choose_graphics()
 
-    from deepracer_exp.evaluation.evaluate import evaluate_run
+    from deepracer_exp.evaluation.run_evaluation import evaluate_run
 
     out = table_console(160)
     with warnings_on_stderr():

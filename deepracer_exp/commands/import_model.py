@@ -9,7 +9,10 @@ from deepracer_exp.agents.actor_critic import PolicyNetworks
 from deepracer_exp.aws.models.archive import StoredModel, read_model
 from deepracer_exp.aws.models.job_settings import read_training_params
 from deepracer_exp.config.compose import Composition, compose_experiment
-from deepracer_exp.config.custom_files import (
+from deepracer_exp.config.custom_files.file_overrides import car_override
+from deepracer_exp.config.custom_files.imported_options import import_files, remove_options
+from deepracer_exp.config.custom_files.job_overrides import job_overrides
+from deepracer_exp.config.custom_files.model_files import (
     KEY,
     PLACES,
     CustomFiles,
@@ -17,13 +20,10 @@ from deepracer_exp.config.custom_files import (
     sensor_overrides,
 )
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.config.file_overrides import car_override
-from deepracer_exp.config.imported_options import import_files, remove_options
-from deepracer_exp.config.job_overrides import job_overrides
 from deepracer_exp.config.overrides import key_of, override_line
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.source import load_reward_source
-from deepracer_exp.training.import_model import fit_weights, networks_to_try, remarks_on_weights
+from deepracer_exp.training.imported_weights import fit_weights, networks_to_try, remarks_on_weights
 from deepracer_exp.training.plan import plan_training
 from deepracer_exp.training.run import store_run
 

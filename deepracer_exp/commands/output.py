@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from deepracer_exp.config.running import TrackingConfig
     from deepracer_exp.reports.tables.log_tables import Table
-    from deepracer_exp.training.result import TrainResult
+    from deepracer_exp.training.train_result import TrainResult
 
 _FILES = {
     REPORT: "findings and figures",

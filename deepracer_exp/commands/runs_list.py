@@ -68,7 +68,7 @@ def _list(args: argparse.Namespace) -> int:
 
     stores = read_stores(args.overrides)
     if stores.uri is not None:
-        from deepracer_exp.tracking.listing import rows_of_store
+        from deepracer_exp.tracking.store_listing import rows_of_store
 
         rows = rows_of_store(stores.uri, stores.runs_dir)
     elif not stores.runs_dir.is_dir():

@@ -9,7 +9,7 @@ from deepracer_exp.errors import BadInput, count, writing
 
 from .arguments import add_command, add_overrides, is_override
 from .evaluate import choose_graphics
-from .files import picture_file
+from .exchange import picture_file
 from .output import (
     check_file,
     is_compiled_first,

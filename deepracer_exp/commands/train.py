@@ -285,8 +285,8 @@ def _sweep(args: argparse.Namespace) -> int:
         write_lap_actions(plan.lap_actions)
 
     from deepracer_exp.sweeps import PAGE_FILE
-    from deepracer_exp.sweeps.report.best import complete_trials
-    from deepracer_exp.sweeps.sweep import sweep
+    from deepracer_exp.sweeps.report.best_trial import complete_trials
+    from deepracer_exp.sweeps.run_sweep import sweep
 
     with warnings_on_stderr():
         study, folder, code = sweep(plan, plain_console(stderr=True))
@@ -336,7 +336,7 @@ def _show_study(word: str, *arguments: str) -> int:
 
 def _print_best(study: "Study") -> None:
     from deepracer_exp.runs.checkpoint_files import checkpoint_words
-    from deepracer_exp.sweeps.report.best import best_line, best_shown, best_trial
+    from deepracer_exp.sweeps.report.best_trial import best_line, best_shown, best_trial
     from deepracer_exp.sweeps.report.last_race import last_race, race_rows
     from deepracer_exp.sweeps.report.page import export_step, tried
 

@@ -17,13 +17,13 @@ from omegaconf.errors import OmegaConfBaseException
 
 from deepracer_exp.addresses import without_passwords
 from deepracer_exp.aws.worlds.catalogue import find_world
+from deepracer_exp.config.custom_files.file_overrides import with_custom_files
 from deepracer_exp.errors import BadInput, Unknown, nearest, reading
 
 from . import acting
 from .dimension import range_length
 from .evaluation import EvaluateConfig, EvaluationConfig
 from .experiment import Experiment
-from .file_overrides import with_custom_files
 from .learning import of_ppo_alone
 from .option_files import change, composed, composed_option, first_line, plain
 from .options import groups, listed, options

@@ -19,7 +19,7 @@ from .learning import (
     PPOConfig,
     SACConfig,
 )
-from .race import ALONE, RaceConfig
+from .racing import ALONE, RaceConfig
 from .running import BudgetConfig, CheckpointsConfig, CollectorConfig, TrackingConfig
 from .stopping import ReliableStopping, StoppingConfig
 from .track import TrackConfig, Tracks

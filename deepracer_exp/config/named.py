@@ -13,7 +13,7 @@ from .evaluation import EvaluationConfig
 from .experiment import Experiment
 from .learning import CNNConfig
 from .overrides import override_line
-from .race import RaceConfig
+from .racing import RaceConfig
 from .track import TrackConfig
 
 

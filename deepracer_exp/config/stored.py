@@ -8,15 +8,16 @@ from typing import Any
 from deepracer_exp.addresses import without_passwords
 from deepracer_exp.errors import BadInput, Unknown, nearest
 
-from . import acting, custom_files
+from . import acting
 from .compose import Composition, check_names, compose_entry, compose_evaluation
+from .custom_files import model_files
 from .evaluation import EvaluateConfig, EvaluationConfig
 from .options import groups
 from .overrides import OPEN_MAPPINGS, group_of, key_of, parse_single
 from .own_class import allow, allow_given
 from .parse import parse_config
 
-_WHOLE = ("experiment", custom_files.KEY)
+_WHOLE = ("experiment", model_files.KEY)
 ABSENT = "\N{EN DASH}"
 """Stands for a missing value."""
 

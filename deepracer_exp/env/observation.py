@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from deepracer_exp.compiled import compiled
 from deepracer_exp.config.driving import ObservationConfig, ObservationShape
 from deepracer_exp.config.own_class import OwnClass, build_own
 from deepracer_exp.errors import BadInput, reading
+from deepracer_exp.jit import compiled
 from deepracer_exp.tracks.segments import pose_at
 from deepracer_exp.tracks.track import TrackIndex, Tracks
 

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from deepracer_exp.compiled import compiled
+from deepracer_exp.jit import compiled
 from deepracer_exp.tracks.segments import is_on_road, pose_at
 
 

@@ -12,7 +12,7 @@ from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.driving import EpisodeConfig, ObservationConfig, RandomizationConfig
 from deepracer_exp.config.evaluation import RealCarConfig
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.config.race import RaceConfig
+from deepracer_exp.config.racing import RaceConfig
 from deepracer_exp.env.others.boxes_and_bots import check_room
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.source import RewardSource, load_reward_source

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deepracer_exp.compiled import compiled
 from deepracer_exp.errors import BadInput
+from deepracer_exp.jit import compiled
 from deepracer_exp.sim.batch import CarState
 from deepracer_exp.tracks.segments import border_point, project_point
 from deepracer_exp.tracks.track import TrackIndex, Tracks

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from deepracer_exp.compiled import compiled
+from deepracer_exp.jit import compiled
 
 from .rule_passes import nearer_of
 from .trace_columns import PACKED_COLUMNS, RANDOMIZED

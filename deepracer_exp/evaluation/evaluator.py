@@ -24,9 +24,9 @@ from deepracer_exp.rewards.source import NO_REWARD
 from deepracer_exp.runs.stored_run import StoredRun
 from deepracer_exp.tracks.track import directed_tracks
 
-from .head_to_head import RivalProtocol
 from .race_protocol import RaceProtocol
-from .result import HELD_OUT, USUAL, Evaluation, TrialGroup
+from .results import HELD_OUT, USUAL, Evaluation, TrialGroup
+from .rival_protocol import RivalProtocol
 from .zigzag import DRIVES, ZigZag, zigzag_of
 
 OnStep = Callable[[Race, RaceProtocol, TensorDict], None]

@@ -23,7 +23,7 @@ from deepracer_exp.tracks.track import Track
 
 from .evaluator import Evaluator
 from .race_protocol import Attempt, RaceProtocol
-from .result import USUAL, Evaluation
+from .results import USUAL, Evaluation
 
 FRAMES_PER_S = 30.0
 _LINGER_S = 1.0

@@ -26,9 +26,9 @@ from deepracer_exp.aws.logs.recorded import (
     typed_table,
 )
 from deepracer_exp.aws.models.model_metadata import ModelMetadata
-from deepracer_exp.config.custom_files import SAC_TAKEN, TAKEN
+from deepracer_exp.config.custom_files.model_files import SAC_TAKEN, TAKEN
 from deepracer_exp.config.driving import OFF, ActionSpaceConfig
-from deepracer_exp.config.race import RaceConfig
+from deepracer_exp.config.racing import RaceConfig
 from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.env.others.placement import PlacedOthers, read_placements
 from deepracer_exp.env.trace_columns import EPISODE_STATUS, SCHEMA

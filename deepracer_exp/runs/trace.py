@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
-from deepracer_exp.config.race import RaceConfig
+from deepracer_exp.config.racing import RaceConfig
 from deepracer_exp.env.others.placement import SCHEMA as OTHERS_SCHEMA
 from deepracer_exp.env.others.placement import PlacedOthers, read_placements
 from deepracer_exp.env.trace_columns import SCHEMA, TRACE_COLUMNS

@@ -10,9 +10,9 @@ import mujoco.batch
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from deepracer_exp.compiled import cfunc, njit
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.errors import RunFailed
+from deepracer_exp.jit import cfunc, njit
 
 from .mujoco_model import build_spec
 from .tyres import DRIVE, Clock, car_record, push_cars

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from deepracer_exp.compiled import njit
+from deepracer_exp.jit import njit
 
 from .camera_boxes import draw_boxes
 from .edges import add_edge

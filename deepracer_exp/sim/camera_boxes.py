@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from deepracer_exp.compiled import njit
+from deepracer_exp.jit import njit
 
 from .edges import add_edge
 from .lens import NEAREST_M, view

@@ -8,7 +8,7 @@ pixel is the mean of what it sees (as glyph rasterisers do, R. Levien, "Inside t
 
 import numpy as np
 
-from deepracer_exp.compiled import njit
+from deepracer_exp.jit import njit
 
 
 @njit(cache=True, fastmath=True, error_model="numpy", inline="always")

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from deepracer_exp.compiled import njit
+from deepracer_exp.jit import njit
 
 NEAREST_M = 0.02
 """Nothing nearer to the picture's plane is seen (deepracer-simapp, `bundle/models/camera/model.sdf`)."""

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from deepracer_exp.compiled import njit
+from deepracer_exp.jit import njit
 
 from .scenery import box_corners
 

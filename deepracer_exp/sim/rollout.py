@@ -7,8 +7,8 @@ forces. The steps are MuJoCo's: semi-implicit Euler.
 import numpy as np
 from numpy.typing import NDArray
 
-from deepracer_exp.compiled import njit
 from deepracer_exp.config.car import CarConfig
+from deepracer_exp.jit import njit
 
 from .tyres import DRIVE, Clock, car_record, push_cars
 

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from deepracer_exp.compiled import njit
 from deepracer_exp.config.car import CarConfig
+from deepracer_exp.jit import njit
 
 GRAVITY_MPS2 = 9.8
 """The gravity of the service's worlds (deepracer-simapp)."""

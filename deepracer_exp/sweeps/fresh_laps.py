@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from optuna.trial import FrozenTrial
 
 from deepracer_exp.config.evaluation import EvaluationConfig
-from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, TrialGroup
+from deepracer_exp.evaluation.results import HELD_OUT, USUAL, Evaluation, TrialGroup
 from deepracer_exp.runs.stored_run import StoredRun
+from deepracer_exp.sweeps.report.best_trial import FreshLaps, complete_trials
 
 from .queue.worker_config import WorkerConfig
-from .report.best import FreshLaps, complete_trials
 from .search.objectives import cost, objective_values, without_lap
 from .trial import Trial
 

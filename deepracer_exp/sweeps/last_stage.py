@@ -16,12 +16,13 @@ from filelock import FileLock, Timeout
 from optuna.trial import FrozenTrial
 
 from deepracer_exp.errors import RunFailed
-from deepracer_exp.evaluation.result import HELD_OUT, USUAL
+from deepracer_exp.evaluation.results import HELD_OUT, USUAL
 from deepracer_exp.reports.pages.run_page import RunReport
 from deepracer_exp.runs.checkpoint_files import checkpoint_words
 from deepracer_exp.runs.run_files import is_run
 from deepracer_exp.runs.run_result import FAILED, INTERRUPTED
 from deepracer_exp.runs.stored_run import StoredRun
+from deepracer_exp.sweeps.report.best_trial import best_trial, complete_trials, reranked, run_of
 from deepracer_exp.tracking.metadata import STUDY
 from deepracer_exp.training.budget import RunEnded
 from deepracer_exp.training.clone import plan_clone
@@ -32,7 +33,6 @@ from deepracer_exp.training.trainer import Callback, Trainer
 from .fresh_laps import drive, fresh, interval_of
 from .queue.claims import Claim
 from .queue.worker_config import WorkerConfig
-from .report.best import best_trial, complete_trials, reranked, run_of
 from .report.last_race import LastRace, Racer, clone_words, store_last_race
 from .report.view import SweepView
 from .search.objectives import objective_values

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from deepracer_exp.config import custom_files
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.custom_files import model_files
 from deepracer_exp.config.dimension import Choices, dimension
 from deepracer_exp.config.options import groups
 from deepracer_exp.config.overrides import group_of, key_of
@@ -58,7 +58,7 @@ def plan_sweep(overrides: Sequence[str], *, is_only_shown: bool = False) -> Swee
     """
     request, study = compose_sweep(overrides), None
     # Files and options that all trials share; the values of the search are checked with its space, which needs Optuna.
-    shared = (*groups(), custom_files.KEY, "runs_dir")
+    shared = (*groups(), model_files.KEY, "runs_dir")
     named = [line for line in request.base if (key := key_of(line)) in shared or key.endswith(".file")]
     remarks = plan_training(*compose_experiment(named)).files.remarks
     if not (is_only_shown and request.space):
@@ -84,7 +84,7 @@ def _with_lap_actions(request: SweepRequest) -> tuple[SweepRequest, LapActions |
     if several := {"track", "car", "experiment"} & set(map(group_of, request.space)):
         raise BadInput(what, f"{min(several)} is searched", "one track and one car, or sweep.lap_actions=[]")
     lines = [
-        line for line in request.base if group_of(line) in ("track", "car", "experiment", custom_files.KEY)
+        line for line in request.base if group_of(line) in ("track", "car", "experiment", model_files.KEY)
     ]
     experiment, composition = compose_experiment(lines, stored=request.stored)
     if len(experiment.tracks) > 1:

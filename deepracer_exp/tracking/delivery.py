@@ -13,7 +13,7 @@ from deepracer_exp.runs.run_result import FAILED, FINISHED, STOPPED_EARLY
 
 from .calls import StoreRefusedError, StoreUnavailableError
 from .metadata import NAME, USER_NOTE, label_tags
-from .metrics import now_ms, points_at
+from .mlflow_metrics import now_ms, points_at
 from .projection import MLflowProjection
 from .store import has_store, open_client, prepare_mlflow, resolve_store
 from .tracking_file import Status, read_recorded, read_tracked_run, write_tracked_run

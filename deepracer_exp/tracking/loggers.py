@@ -14,7 +14,7 @@ from typing_extensions import override
 from deepracer_exp.config.running import WandbTracking
 from deepracer_exp.runs.run_files import TENSORBOARD, WANDB
 
-from .metrics import recordable_values
+from .mlflow_metrics import recordable_values
 from .projection import RunProjection, files_to_keep
 from .tracking_file import TrackedRun
 

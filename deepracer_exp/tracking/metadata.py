@@ -13,7 +13,7 @@ from deepracer_exp.runs.lineage import Lineage
 from deepracer_exp.runs.run_files import BEST_LAP, REPORT, who_and_where
 from deepracer_exp.runs.run_result import of_conditions
 
-from .metrics import BEST, METRICS, TRACK_METRICS, best_metrics, metric_name, trial_metric
+from .mlflow_metrics import BEST, METRICS, TRACK_METRICS, best_metrics, metric_name, trial_metric
 
 Scalar = str | int | float | bool | None
 

@@ -29,7 +29,7 @@ from .metadata import (
     result_note,
     study_experiment_note,
 )
-from .metrics import BEST, Point, best_metrics, points_at
+from .mlflow_metrics import BEST, Point, best_metrics, points_at
 from .store import Store, client_of, silence_mlflow
 from .tracking_file import Group, TrackedRun
 

@@ -32,7 +32,7 @@ from deepracer_exp.runs.run_files import (
 
 from .calls import StoreRefusedError, StoreUnavailableError
 from .metadata import END_TAG, KIND, NOTE, STUDY, label_tags
-from .metrics import Point, now_ms, points_at, points_of, recordable_values, without_evaluation
+from .mlflow_metrics import Point, now_ms, points_at, points_of, recordable_values, without_evaluation
 from .store import Store, prepare_mlflow
 from .tracking_file import REFUSED, Recorded, TrackedRun, read_recorded, read_tracked_run, write_recorded
 

@@ -29,7 +29,7 @@ from deepracer_exp.runs.run_files import (
 from .calls import CALL_S, ended_within, pages
 from .download import Download, download
 from .metadata import picture, race_result
-from .metrics import metric_names
+from .mlflow_metrics import metric_names
 from .store import Store, client_of, existing_store, has_store, open_client
 
 if TYPE_CHECKING:

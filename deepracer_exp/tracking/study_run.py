@@ -13,7 +13,7 @@ from pathlib import Path
 from deepracer_exp.errors import BadInput
 
 from .metadata import END_TAG, KIND, NOTE, PARENT, STUDY, param_text, study_view, user_tags
-from .metrics import now_ms, trial_metrics
+from .mlflow_metrics import now_ms, trial_metrics
 from .projector import ProjectedRun, Projector
 from .store import Store
 from .tracking_file import Group, Status, TrackedRun, read_recorded, read_tracked_run

@@ -14,7 +14,7 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.run_files import TENSORBOARD, WANDB
 
 from .metadata import END_TAG
-from .metrics import now_ms
+from .mlflow_metrics import now_ms
 from .projector import ProjectedRun, Projector, Target, kind_of
 from .store import Store, resolve_store
 from .tracking_file import Status, TrackedRun

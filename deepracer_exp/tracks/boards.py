@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-from deepracer_exp.config.custom_files import CARS
+from deepracer_exp.config.custom_files.model_files import CARS
 
 FILE = Path(__file__).with_name("boards.csv")
 _VERSION_5_SINCE = "2022-07-21"

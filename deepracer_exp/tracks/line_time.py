@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from deepracer_exp.compiled import njit
+from deepracer_exp.jit import njit
 
 from .track import Track
 

@@ -16,7 +16,7 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from deepracer_exp.aws.worlds.routes import is_first_of_equals
-from deepracer_exp.compiled import compiled, njit
+from deepracer_exp.jit import compiled, njit
 
 CELL_M = 0.1
 """Side of a grid cell; doubled until the grid has at most `MOST_CELLS`."""

@@ -15,7 +15,7 @@ from deepracer_exp.runs.run_result import Ending
 from deepracer_exp.runs.stored_run import StoredRun
 from deepracer_exp.tracking.delivery import ENDS
 from deepracer_exp.tracking.metadata import END_TAG, joined
-from deepracer_exp.tracking.metrics import now_ms
+from deepracer_exp.tracking.mlflow_metrics import now_ms
 from deepracer_exp.tracking.tracker import FINISH_S, Tracker
 from deepracer_exp.training.stopping.stopping_rules import Decision, StoppingRule, build_rule
 
@@ -23,7 +23,7 @@ from .budget import Alerts
 from .display import ProgressDisplay, RunHeader
 from .machine import machine_use
 from .metrics import AMONG_OTHERS, NOT_EVALUATED, eval_columns
-from .result import TrainResult
+from .train_result import TrainResult
 from .trainer import Callback, Trainer
 
 logger = logging.getLogger("deepracer_exp")

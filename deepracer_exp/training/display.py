@@ -15,7 +15,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from deepracer_exp.tracking.metrics import track_metric
+from deepracer_exp.tracking.mlflow_metrics import track_metric
 
 Row = Mapping[str, float | int | None]
 """One line of metrics.jsonl."""

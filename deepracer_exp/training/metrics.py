@@ -11,9 +11,9 @@ from deepracer_exp.config.stopping import ReliableStopping, StoppingConfig
 from deepracer_exp.env.rules import lap_clock_s
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.env.trace_columns import PACKED, STATUS_CODE
-from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, zigzag_columns
+from deepracer_exp.evaluation.results import HELD_OUT, USUAL, Evaluation, zigzag_columns
 from deepracer_exp.runs.fingerprint import REMEMBERED_EPISODES
-from deepracer_exp.tracking.metrics import track_labels, track_metric
+from deepracer_exp.tracking.mlflow_metrics import track_labels, track_metric
 
 TIMES = ("wall_clock_s", "collect_s", "update_s", "env_steps_per_s")
 """Columns of metrics.jsonl that differ between two runs of the same seed."""

@@ -48,7 +48,7 @@ from deepracer_exp.runs.stored_run import StoredRun
 from deepracer_exp.scratch import folder_aside
 from deepracer_exp.sim.batch import CarBatch
 from deepracer_exp.tracking.metadata import joined, lineage_tags, run_params, run_tags
-from deepracer_exp.tracking.metrics import now_ms
+from deepracer_exp.tracking.mlflow_metrics import now_ms
 from deepracer_exp.tracking.projector import Projector
 from deepracer_exp.tracking.tracker import open_tracker
 from deepracer_exp.tracking.tracking_file import TrackedRun, begin_again, read_tracked_run
@@ -60,9 +60,9 @@ from .clone import describe_clone, read_parent
 from .machine import memory_needed
 from .metrics import track_names
 from .plan import ResumePlan, TrainPlan
-from .result import TakenOver, TrainResult
 from .rounding import rounded
 from .signals import Interruption
+from .train_result import TakenOver, TrainResult
 from .trainer import Callback, Trainer
 
 logger = logging.getLogger("deepracer_exp")

@@ -25,7 +25,7 @@ from deepracer_exp.env.others.placement import placements_table
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.env.trace_columns import PACKED, to_table
 from deepracer_exp.errors import RunFailed, reading
-from deepracer_exp.evaluation.result import Evaluation
+from deepracer_exp.evaluation.results import Evaluation
 from deepracer_exp.evaluation.rival_run import kept_rival
 from deepracer_exp.runs.checkpoints import CheckpointStore, read_agent
 from deepracer_exp.runs.crash_dump import write_crash_dump
@@ -36,12 +36,12 @@ from deepracer_exp.runs.run_result import FAILED, FINISHED, INTERRUPTED, Ending,
 from deepracer_exp.runs.trace import trace_writer
 from deepracer_exp.sim.batch import cores
 
-from .best import BestPolicy
+from .best_policy import BestPolicy
 from .budget import Budget
 from .metrics import NOT_EVALUATED, Finished, RunMetrics, track_names
-from .result import TrainResult
-from .rivals import RivalPool
+from .rival_pool import RivalPool
 from .signals import Interruption
+from .train_result import TrainResult
 
 logger = logging.getLogger("deepracer_exp")
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from deepracer_exp.collectors import watchdog
+from deepracer_exp.collectors.car_worker import EnvFactory
 from deepracer_exp.collectors.collector import worker_count
-from deepracer_exp.collectors.worker import EnvFactory
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.trace_columns import PACKED
 from deepracer_exp.errors import RunFailed

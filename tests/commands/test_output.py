@@ -13,7 +13,7 @@ import deepracer_exp
 from deepracer_exp.commands.output import plain_console, print_result, print_steps, print_unsent
 from deepracer_exp.config.running import MLflowTracking
 from deepracer_exp.runs.run_result import Ending
-from deepracer_exp.training.result import TrainResult
+from deepracer_exp.training.train_result import TrainResult
 
 
 @pytest.mark.parametrize(("columns", "lines"), [(80, 2), (46, 4)])

@@ -7,9 +7,9 @@ import yaml
 
 from deepracer_exp.aws.models import hyperparameters, model_metadata
 from deepracer_exp.config.compose import Composition, compose_experiment, expand_grid
-from deepracer_exp.config.custom_files import TAKEN, read_custom_files
+from deepracer_exp.config.custom_files.file_overrides import FileOverrides, with_custom_files
+from deepracer_exp.config.custom_files.model_files import TAKEN, read_custom_files
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.config.file_overrides import FileOverrides, with_custom_files
 from deepracer_exp.config.learning import PPOConfig, SACConfig
 from deepracer_exp.config.overrides import override_line, parse_single
 from deepracer_exp.config.parse import parse_config, parse_experiment

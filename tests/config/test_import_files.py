@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from deepracer_exp.config.compose import Composition, compose_experiment
-from deepracer_exp.config.custom_files import read_custom_files
-from deepracer_exp.config.imported_options import import_files
+from deepracer_exp.config.custom_files.imported_options import import_files
+from deepracer_exp.config.custom_files.model_files import read_custom_files
 from tests.conftest import refused
 
 from .conftest import CONTINUOUS, METADATA, REWARD

@@ -7,8 +7,8 @@ import pytest
 
 from deepracer_exp.aws.models.job_settings import race_values, read_training_params
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.config.job_overrides import job_overrides
-from deepracer_exp.config.job_race import recorded_race
+from deepracer_exp.config.custom_files.job_overrides import job_overrides
+from deepracer_exp.config.custom_files.job_race import recorded_race
 from tests.conftest import refused
 
 from .conftest import METADATA, REWARD

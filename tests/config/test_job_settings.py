@@ -7,8 +7,8 @@ import pytest
 
 from deepracer_exp.aws.models.job_settings import read_training_params
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.config.custom_files import read_custom_files
-from deepracer_exp.config.job_overrides import job_overrides
+from deepracer_exp.config.custom_files.job_overrides import job_overrides
+from deepracer_exp.config.custom_files.model_files import read_custom_files
 from deepracer_exp.errors import BadInput
 
 from .conftest import METADATA, REWARD

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from deepracer_exp.env.others.head_to_head import HeadToHead, rival_setup
 
 from deepracer_exp.agents.actor_critic import build_actor_critic
 from deepracer_exp.agents.schedules import PresetSchedule
@@ -14,6 +13,7 @@ from deepracer_exp.config.compose import Composition, compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.options import conf_dir, groups, options
 from deepracer_exp.env.observation import observation_shape
+from deepracer_exp.env.others.head_to_head import HeadToHead, rival_setup
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.training.budget import Budget

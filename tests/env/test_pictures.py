@@ -1,14 +1,14 @@
 import numpy as np
 import pytest
 import shapely
-from deepracer_exp.env.randomization.picture_randomization import (
-    QUANTITIES,
-    PictureRandomization,
-)
 
 from deepracer_exp.config.driving import PictureRandomizationConfig
 from deepracer_exp.config.track import FloorConfig
 from deepracer_exp.env.pictures import GREY, floor_colors
+from deepracer_exp.env.randomization.picture_randomization import (
+    QUANTITIES,
+    PictureRandomization,
+)
 from deepracer_exp.sim.scenery import MATERIALS, box_corners, paved_area, wall_ring
 from tests.env.conftest import drive_and_see
 

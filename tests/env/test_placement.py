@@ -4,6 +4,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import torch
+
 from deepracer_exp.env.others.head_to_head import HeadToHead, rival_setup
 from deepracer_exp.env.others.placement import (
     SCHEMA,
@@ -11,7 +12,6 @@ from deepracer_exp.env.others.placement import (
     read_placements,
     rebuild_poses,
 )
-
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.trace_columns import PACKED
 from tests.env.conftest import make_setup, random_actions

@@ -4,12 +4,12 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from deepracer_exp.env.randomization.car_randomization import CarStreams, of_each_car
 
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.driving import OFF, QUANTITIES
 from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.env.race import Race
+from deepracer_exp.env.randomization.car_randomization import CarStreams, of_each_car
 from deepracer_exp.env.trace_columns import PACKED, RANDOMIZED
 from deepracer_exp.errors import BadInput
 from deepracer_exp.sim.batch import CarBatch

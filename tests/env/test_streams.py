@@ -2,6 +2,7 @@ import itertools
 
 import numpy as np
 import pytest
+
 from deepracer_exp.env.randomization.car_randomization import CarStreams, Purpose, StepNoise
 
 

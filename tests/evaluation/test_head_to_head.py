@@ -7,8 +7,8 @@ import pytest
 
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.evaluation.head_to_head import DRAWN, LOST, WON, RivalProtocol
 from deepracer_exp.evaluation.race_protocol import Attempt, RaceProtocol
+from deepracer_exp.evaluation.rival_protocol import DRAWN, LOST, WON, RivalProtocol
 
 from .conftest import Driver
 

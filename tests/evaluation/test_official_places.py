@@ -6,8 +6,8 @@ import json
 import pytest
 
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.evaluation.evaluate import official_places
-from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, TrialGroup
+from deepracer_exp.evaluation.results import HELD_OUT, USUAL, Evaluation, TrialGroup
+from deepracer_exp.evaluation.run_evaluation import official_places
 from deepracer_exp.runs.next_steps import official_place
 from deepracer_exp.runs.run_files import RunRecord
 from deepracer_exp.tracks import boards

@@ -9,8 +9,8 @@ import torch
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment
 from deepracer_exp.config.evaluation import RealCarConfig
 from deepracer_exp.errors import BadInput
-from deepracer_exp.evaluation.evaluate import CAR, SIMULATOR, car_figures, car_protocols, race_car_parts
 from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.evaluation.run_evaluation import CAR, SIMULATOR, car_figures, car_protocols, race_car_parts
 
 
 class BrightSide(torch.nn.Module):

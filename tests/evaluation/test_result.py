@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deepracer_exp.evaluation.race_protocol import Attempt
-from deepracer_exp.evaluation.result import Evaluation, TrialGroup
+from deepracer_exp.evaluation.results import Evaluation, TrialGroup
 
 
 def attempt(trial=0, time_s=10.0, progress=100.0, end=None, **more):

@@ -12,9 +12,9 @@ import yaml
 from rich.console import Console
 
 from deepracer_exp.config.stored import request_evaluation
-from deepracer_exp.evaluation.evaluate import results_table
 from deepracer_exp.evaluation.plan import plan_evaluation
-from deepracer_exp.evaluation.result import Evaluation
+from deepracer_exp.evaluation.results import Evaluation
+from deepracer_exp.evaluation.run_evaluation import results_table
 from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.tracking.resolve import resolve
 from tests.conftest import refused

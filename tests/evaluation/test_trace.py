@@ -3,14 +3,14 @@
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from deepracer_exp.env.others.placement import rebuild_poses
 
 from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.env.others.placement import rebuild_poses
 from deepracer_exp.env.trace_columns import STATUS_CODE
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.evaluation.trace import TraceRecorder, pauses_left_s
+from deepracer_exp.evaluation.trace_recorder import TraceRecorder, pauses_left_s
 from deepracer_exp.reports.findings import findings
 from deepracer_exp.reports.pages.log_report import LogPage, draw_sections
 from deepracer_exp.reports.tables.log_view import prepare

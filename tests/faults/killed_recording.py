@@ -16,7 +16,7 @@ from pathlib import Path
 
 from deepracer_exp.runs.run_files import read_metrics
 from deepracer_exp.tracking import projection, projector
-from deepracer_exp.tracking.metrics import now_ms
+from deepracer_exp.tracking.mlflow_metrics import now_ms
 from deepracer_exp.tracking.mlflow_run import MLflowRun
 from deepracer_exp.tracking.store import resolve_store
 from deepracer_exp.tracking.tracker import ProjectedTracker

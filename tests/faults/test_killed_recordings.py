@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from mlflow import MlflowClient
 
-from deepracer_exp.tracking.metrics import metric_name
+from deepracer_exp.tracking.mlflow_metrics import metric_name
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from mlflow import MlflowClient
 
 from benchmarks.same import different_rows, different_tensors, different_traces
 from deepracer_exp.runs.run_files import read_metrics
-from deepracer_exp.tracking.metrics import MACHINE, metric_name
+from deepracer_exp.tracking.mlflow_metrics import MACHINE, metric_name
 from deepracer_exp.training.metrics import TIMES
 
 ITERATIONS = 14

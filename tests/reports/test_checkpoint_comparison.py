@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from deepracer_exp.evaluation.result import Evaluation
+from deepracer_exp.evaluation.results import Evaluation
 from deepracer_exp.reports.charts.run_charts import speed_and_stability
 from deepracer_exp.reports.pages.checkpoint_comparison import (
     CheckpointResult,

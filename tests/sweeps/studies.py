@@ -15,7 +15,7 @@ from optuna.study import StudyDirection
 from optuna.trial import TrialState, create_trial
 
 from deepracer_exp.config.sweep import SweepConfig, compose_sweep
-from deepracer_exp.sweeps.report.best import FreshLaps
+from deepracer_exp.sweeps.report.best_trial import FreshLaps
 from deepracer_exp.sweeps.trial import SeedRun, Trial
 
 DISTRIBUTIONS: Mapping[str, BaseDistribution] = {

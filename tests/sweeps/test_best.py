@@ -8,7 +8,7 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.best_run import best_run_of_sweep, read_best_of_sweep
 from deepracer_exp.runs.run_files import BEST_OF_SWEEP
-from deepracer_exp.sweeps.report.best import (
+from deepracer_exp.sweeps.report.best_trial import (
     best_line,
     best_run,
     best_trial,

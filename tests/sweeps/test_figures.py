@@ -6,7 +6,7 @@ import plotly.graph_objects as go
 import pytest
 
 from deepracer_exp.sweeps.report.figures import FEWEST_COMPLETE, figures, narrowed
-from deepracer_exp.sweeps.report.labels import ENDINGS, ending_of, short_keys
+from deepracer_exp.sweeps.report.wording import ENDINGS, ending_of, short_keys
 
 from .studies import DISTRIBUTIONS, add, new_study
 

@@ -9,7 +9,7 @@ import pytest
 from deepracer_exp.runs.lineage import read_lineage
 from deepracer_exp.runs.run_files import read_config, read_object
 from deepracer_exp.sweeps.last_stage import LastStage
-from deepracer_exp.sweeps.report.best import best_run, best_trial
+from deepracer_exp.sweeps.report.best_trial import best_run, best_trial
 from deepracer_exp.sweeps.report.last_race import last_race
 from deepracer_exp.sweeps.trial import Interrupted
 from deepracer_exp.tracking.resolve import resolve

@@ -6,7 +6,7 @@ import sqlalchemy as sa
 from deepracer_exp.sweeps.queue.claims import TrialClaims
 from deepracer_exp.sweeps.queue.lease import Lease
 from deepracer_exp.sweeps.trial import Trial
-from deepracer_exp.training.result import TakenOver
+from deepracer_exp.training.train_result import TakenOver
 from tests.waiting import wait_until
 
 HOUR_S = 3600.0

@@ -5,9 +5,9 @@ from optuna.distributions import FloatDistribution
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.reports.tables.evidence import SAME
-from deepracer_exp.sweeps.report.best import over_seeds
-from deepracer_exp.sweeps.report.labels import short_keys
+from deepracer_exp.sweeps.report.best_trial import over_seeds
 from deepracer_exp.sweeps.report.page import study_page, study_summary, write_study_page
+from deepracer_exp.sweeps.report.wording import short_keys
 from deepracer_exp.sweeps.trial import SeedRun, runs_as_json
 from tests.browser import needs_chromium
 from tests.page_html import Html

@@ -12,15 +12,15 @@ from deepracer_exp.config.compose import compose_evaluation, compose_experiment
 from deepracer_exp.config.sweep import compose_sweep
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.evaluation.race_protocol import Attempt
-from deepracer_exp.evaluation.result import HELD_OUT, USUAL, Evaluation, TrialGroup
+from deepracer_exp.evaluation.results import HELD_OUT, USUAL, Evaluation, TrialGroup
 from deepracer_exp.runs.run_files import read_object
 from deepracer_exp.sweeps.fresh_laps import interval_of
 from deepracer_exp.sweeps.queue.claims import Claim
 from deepracer_exp.sweeps.queue.driver import Driver
 from deepracer_exp.sweeps.queue.storage import open_storage
 from deepracer_exp.sweeps.queue.worker_config import Parent
+from deepracer_exp.sweeps.run_sweep import _conclude, _parent, _without_rules, begin_study_run
 from deepracer_exp.sweeps.search.space import SearchSpace
-from deepracer_exp.sweeps.sweep import _conclude, _parent, _without_rules, begin_study_run
 from deepracer_exp.sweeps.trial import Interrupted, SeedRun, Trial
 from deepracer_exp.tracking.store import resolve_store
 from deepracer_exp.training.signals import Interruption

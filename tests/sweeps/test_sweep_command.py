@@ -10,7 +10,7 @@ from optuna.trial import TrialState
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.runs.run_files import read_config, read_object
 from deepracer_exp.sweeps.queue.storage import open_storage
-from deepracer_exp.sweeps.report.best import best_line, best_run
+from deepracer_exp.sweeps.report.best_trial import best_line, best_run
 from deepracer_exp.sweeps.trial import Trial
 from tests.training.conftest import assert_same_run, workers_start_early  # noqa: F401 - a fixture
 

@@ -17,7 +17,7 @@ from mlflow import MlflowClient
 from deepracer_exp.runs.checkpoint_files import write_hashes
 from deepracer_exp.runs.run_files import read_run_id
 from deepracer_exp.tracking import project, projector
-from deepracer_exp.tracking.metrics import metric_name, now_ms
+from deepracer_exp.tracking.mlflow_metrics import metric_name, now_ms
 from deepracer_exp.tracking.mlflow_run import MLflowRun
 from deepracer_exp.tracking.registry import Registered, promote
 from deepracer_exp.tracking.store import Store, resolve_store

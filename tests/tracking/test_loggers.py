@@ -10,7 +10,7 @@ from deepracer_exp.config.running import WandbTracking
 from deepracer_exp.runs.run_files import TENSORBOARD, WANDB
 from deepracer_exp.tracking.delivery import undelivered
 from deepracer_exp.tracking.loggers import TensorBoardProjection, WandbProjection
-from deepracer_exp.tracking.metrics import METRICS, metric_name
+from deepracer_exp.tracking.mlflow_metrics import METRICS, metric_name
 from deepracer_exp.tracking.projection import RunProjection
 from deepracer_exp.tracking.tracking_file import TrackedRun, write_tracked_run
 from tests.conftest import IN_PROCESS

@@ -12,7 +12,7 @@ from mlflow import MlflowClient
 from deepracer_exp.runs.run_files import read_run_id
 from deepracer_exp.tracking import projector
 from deepracer_exp.tracking.metadata import param_text
-from deepracer_exp.tracking.metrics import metric_name, now_ms
+from deepracer_exp.tracking.mlflow_metrics import metric_name, now_ms
 from deepracer_exp.tracking.mlflow_run import MLflowRun
 from deepracer_exp.tracking.projection import MLflowProjection
 from deepracer_exp.tracking.store import resolve_store

@@ -18,7 +18,7 @@ from deepracer_exp.tracking.metadata import (
     run_tags,
     user_tags,
 )
-from deepracer_exp.tracking.metrics import (
+from deepracer_exp.tracking.mlflow_metrics import (
     BEST,
     METRICS,
     TRACK_METRICS,

@@ -12,7 +12,7 @@ import pytest
 
 from deepracer_exp.runs.run_files import read_run_id
 from deepracer_exp.tracking import projector
-from deepracer_exp.tracking.metrics import now_ms
+from deepracer_exp.tracking.mlflow_metrics import now_ms
 from deepracer_exp.tracking.projector import Projector
 from deepracer_exp.tracking.tracker import ProjectedTracker
 from deepracer_exp.tracking.tracking_file import (

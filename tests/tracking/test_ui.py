@@ -13,7 +13,7 @@ from mlflow import MlflowClient
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.tracking import ui
 from deepracer_exp.tracking.metadata import VIEW, run_params, run_tags
-from deepracer_exp.tracking.metrics import METRICS
+from deepracer_exp.tracking.mlflow_metrics import METRICS
 from deepracer_exp.tracking.registry import look_up
 from deepracer_exp.tracking.store import existing_store
 from deepracer_exp.tracking.ui import running_ui, runs_page, serve_ui

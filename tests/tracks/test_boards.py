@@ -10,7 +10,7 @@ import pytest
 from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.aws.worlds.catalogue import worlds
 from deepracer_exp.aws.worlds.routes import world_rows
-from deepracer_exp.config.custom_files import CARS
+from deepracer_exp.config.custom_files.model_files import CARS
 from deepracer_exp.config.options import options
 from deepracer_exp.tracks import boards
 from deepracer_exp.tracks.boards import Board, boards_of, standings, what_it_sees

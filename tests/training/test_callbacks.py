@@ -10,8 +10,8 @@ from deepracer_exp.runs.run_files import read_metrics, read_run_id
 from deepracer_exp.runs.run_result import STOPPED_EARLY, fastest_reliable
 from deepracer_exp.runs.stored_run import StoredRun
 from deepracer_exp.training.plan import plan_resume, plan_training
-from deepracer_exp.training.result import TakenOver
 from deepracer_exp.training.run import copy_run, run_training
+from deepracer_exp.training.train_result import TakenOver
 from deepracer_exp.training.trainer import Callback
 
 from .conftest import assert_same_run

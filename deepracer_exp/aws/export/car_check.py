@@ -24,7 +24,12 @@ from deepracer_exp.env.action_space import ActionSpace
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.trace_columns import PACKED, STATUS_CODE
 from deepracer_exp.errors import RunFailed, writing
-from deepracer_exp.evaluation.evaluate import (
+from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.evaluation.film import LapRecorder, best_attempt, png
+from deepracer_exp.evaluation.plan import EvaluatePlan
+from deepracer_exp.evaluation.race_protocol import RaceProtocol
+from deepracer_exp.evaluation.results import USUAL, Evaluation, number
+from deepracer_exp.evaluation.run_evaluation import (
     CAR,
     SIMULATOR,
     car_figures,
@@ -32,11 +37,6 @@ from deepracer_exp.evaluation.evaluate import (
     explain_controls,
     write_evaluation,
 )
-from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.evaluation.film import LapRecorder, best_attempt, png
-from deepracer_exp.evaluation.plan import EvaluatePlan
-from deepracer_exp.evaluation.race_protocol import RaceProtocol
-from deepracer_exp.evaluation.result import USUAL, Evaluation, number
 from deepracer_exp.evaluation.zigzag import CURE, ZIGZAG_DEG, ZIGZAG_PER_M, ZigZag
 from deepracer_exp.files import atomic_write
 from deepracer_exp.reports.pages.picture_changes import TriedPictures, pictures_sheet, try_pictures

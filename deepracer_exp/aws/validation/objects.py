@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from deepracer_exp.config.race import ALONE, BoxPosition
+from deepracer_exp.config.racing import ALONE, BoxPosition
 from deepracer_exp.env.others.boxes_and_bots import Others
 from deepracer_exp.env.others.placement import Placement, draw_placements
 from deepracer_exp.env.others.race_others import RaceOthers

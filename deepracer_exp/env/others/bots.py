@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from deepracer_exp.compiled import njit
+from deepracer_exp.jit import njit
 
 from .service_draws import uniform
 

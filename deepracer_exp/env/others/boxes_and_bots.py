@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deepracer_exp.config.race import BoxesConfig, RaceConfig
+from deepracer_exp.config.racing import BoxesConfig, RaceConfig
 from deepracer_exp.errors import BadInput
 from deepracer_exp.tracks.lanes import Lanes, Paths
 from deepracer_exp.tracks.track import Track, TrackIndex, Tracks

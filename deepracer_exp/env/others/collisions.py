@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from deepracer_exp.compiled import njit
+from deepracer_exp.jit import njit
 
 CAR_M = (0.32352, 0.1961)
 """Crash rectangle of a car or bot, along and across, centred on its origin (deepracer-simapp,

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch.distributions import Categorical
 
 from deepracer_exp.config.driving import ObservationConfig, RandomizationConfig
-from deepracer_exp.config.race import RivalsConfig
+from deepracer_exp.config.racing import RivalsConfig
 from deepracer_exp.env.observation import build_parts
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.randomization.car_randomization import CarStreams, Purpose

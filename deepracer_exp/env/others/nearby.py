@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from deepracer_exp.compiled import njit
+from deepracer_exp.jit import njit
 
 SHOWN = 4
 """Number of features that `next_ones` returns of each."""

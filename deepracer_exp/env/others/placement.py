@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from deepracer_exp.config.race import LANES, RaceConfig
+from deepracer_exp.config.racing import LANES, RaceConfig
 from deepracer_exp.env.randomization.car_randomization import CarStreams, Purpose
 from deepracer_exp.env.rules import lap_clock_s
 from deepracer_exp.env.setup import RaceSetup

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deepracer_exp.config.race import RaceConfig
+from deepracer_exp.config.racing import RaceConfig
 from deepracer_exp.env.randomization.car_randomization import CarStreams, Purpose
 from deepracer_exp.env.rules import Bools, Ids, RaceRules, StepResult, lap_clock_s
 from deepracer_exp.env.setup import RaceSetup

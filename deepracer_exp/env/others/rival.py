@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deepracer_exp.config.race import RaceConfig
+from deepracer_exp.config.racing import RaceConfig
 from deepracer_exp.env.rules import Bools, Ids, RaceRules
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.env.state import Floats

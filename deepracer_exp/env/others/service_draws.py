@@ -6,7 +6,7 @@ one compiled pass (Steele and others, "Fast splittable pseudorandom number gener
 
 import numpy as np
 
-from deepracer_exp.compiled import njit
+from deepracer_exp.jit import njit
 
 END_M = 1.0
 """The last box or bot is placed at least so far before the start line (the service's)."""

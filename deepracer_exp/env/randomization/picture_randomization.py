@@ -7,8 +7,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from deepracer_exp.compiled import njit
 from deepracer_exp.config.driving import PictureRandomizationConfig
+from deepracer_exp.jit import njit
 from deepracer_exp.sim.scenery import MATERIALS, paved_area, wall_ring
 from deepracer_exp.tracks.track import Track
 

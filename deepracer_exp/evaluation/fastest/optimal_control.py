@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from deepracer_exp.compiled import njit
+from deepracer_exp.jit import njit
 from deepracer_exp.sim.rollout import advance, linearise
 from deepracer_exp.tracks.segments import along, is_on_road, nearest_segment
 

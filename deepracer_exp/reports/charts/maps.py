@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from deepracer_exp.compiled import njit
+from deepracer_exp.jit import njit
 from deepracer_exp.reports.tables.statistics import Values, means
 from deepracer_exp.tracks.outline import Outline
 from deepracer_exp.tracks.track import Track

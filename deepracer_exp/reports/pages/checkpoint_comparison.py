@@ -14,9 +14,8 @@ from rich.table import Table
 
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.errors import BadInput, count, writing
-from deepracer_exp.evaluation.evaluate import fit
 from deepracer_exp.evaluation.evaluator import Evaluator, evaluator_against
-from deepracer_exp.evaluation.result import (
+from deepracer_exp.evaluation.results import (
     CONFIDENCE,
     HELD_OUT,
     NOTHING,
@@ -26,6 +25,7 @@ from deepracer_exp.evaluation.result import (
     Rank,
     number,
 )
+from deepracer_exp.evaluation.run_evaluation import fit
 from deepracer_exp.reports.charts.run_charts import evaluated_laps, speed_and_stability
 from deepracer_exp.reports.tables.log_tables import Table as PageTable
 from deepracer_exp.runs.checkpoint_files import (

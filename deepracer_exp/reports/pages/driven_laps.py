@@ -13,7 +13,7 @@ from deepracer_exp.errors import BadInput, count
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.film import LapRecorder, best_attempt
 from deepracer_exp.evaluation.race_protocol import Attempt
-from deepracer_exp.evaluation.result import USUAL, Evaluation
+from deepracer_exp.evaluation.results import USUAL, Evaluation
 from deepracer_exp.reports.tables.proposed_actions import Commands, fast_laps, fast_laps_in_words
 from deepracer_exp.runs.checkpoint_files import checkpoint_words
 from deepracer_exp.runs.checkpoints import StoredPolicy

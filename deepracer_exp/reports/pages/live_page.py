@@ -16,10 +16,10 @@ from rich.table import Table
 
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.errors import BadInput
-from deepracer_exp.evaluation.evaluate import results_table, trained_on
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.film import LapRecorder, best_attempt
-from deepracer_exp.evaluation.result import USUAL, Evaluation
+from deepracer_exp.evaluation.results import USUAL, Evaluation
+from deepracer_exp.evaluation.run_evaluation import results_table, trained_on
 from deepracer_exp.reports.charts.live_charts import curves_so_far, newest_laps
 from deepracer_exp.reports.charts.run_pictures import TrackLines
 from deepracer_exp.runs.checkpoint_files import checkpoint_words

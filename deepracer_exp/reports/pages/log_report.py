@@ -156,7 +156,7 @@ def draw_sections(page: LogPage) -> dict[str, list[Chart]]:
     view = page.view
     drawn: dict[str, list[Chart | None]] = {}
     if page.replay is not None:
-        drawn["Another reward function"] = reward_charts.replayed_charts(page.replay)
+        drawn["Another reward function"] = [*reward_charts.replayed_charts(page.replay)]
     sections = SECTIONS if view.trained else RACES
     unknown = _OF_FAILURES if view.laps_only else ()
     lap = page.best.lap if page.best is not None else driving_line.raced_lap(view)

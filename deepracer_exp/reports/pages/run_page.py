@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.config.race import RaceConfig
+from deepracer_exp.config.racing import RaceConfig
 from deepracer_exp.env.others.placement import box_corners_of, read_placements
 from deepracer_exp.env.setup import Course
 from deepracer_exp.runs.next_steps import COMMAND, own_word
@@ -18,7 +18,7 @@ from deepracer_exp.runs.run_files import BEST_LAP, LEARNING, METRICS, REPORT, TR
 from deepracer_exp.runs.run_result import FINISHED, STOPPED_EARLY
 from deepracer_exp.runs.trace import has_trace, missing_trace, read_others, read_trace
 from deepracer_exp.tracks.track import Track
-from deepracer_exp.training.result import TrainResult
+from deepracer_exp.training.train_result import TrainResult
 from deepracer_exp.training.trainer import Callback, Trainer
 
 logger = logging.getLogger("deepracer_exp")

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from deepracer_exp.compiled import njit
+from deepracer_exp.jit import njit
 
 Values = NDArray[np.float64]
 MOST_ROWS = 100_000

@@ -9,9 +9,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from deepracer_exp.aws.logs.recorded import TRAINING
-from deepracer_exp.compiled import njit
 from deepracer_exp.env.rules import lap_clock_s
 from deepracer_exp.evaluation.zigzag import STILL_M
+from deepracer_exp.jit import njit
 from deepracer_exp.tracks.track import Track
 
 from .statistics import MOST_ROWS, Values, subsample

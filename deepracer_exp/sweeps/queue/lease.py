@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any, Self
 
-from deepracer_exp.training.result import TakenOver
+from deepracer_exp.training.train_result import TakenOver
 
 from .claims import Claim, TrialClaims
 from .storage import DOWN, patiently

@@ -14,9 +14,9 @@ from optuna.trial import FrozenTrial
 
 from deepracer_exp.config.overrides import key_of
 from deepracer_exp.errors import RunFailed
-from deepracer_exp.evaluation.evaluate import write_evaluation
 from deepracer_exp.evaluation.evaluator import Evaluator
-from deepracer_exp.evaluation.result import HELD_OUT, USUAL
+from deepracer_exp.evaluation.results import HELD_OUT, USUAL
+from deepracer_exp.evaluation.run_evaluation import write_evaluation
 from deepracer_exp.reports.pages.run_page import RunReport
 from deepracer_exp.runs.checkpoint_files import kept_checkpoints
 from deepracer_exp.runs.folder import is_held
@@ -35,14 +35,14 @@ from deepracer_exp.sweeps.search.objectives import intermediate_value, objective
 from deepracer_exp.sweeps.search.pruners import FirstOf, PruneDecision
 from deepracer_exp.sweeps.trial import Interrupted, SeedRun, Trial, runs_as_json
 from deepracer_exp.tracking.metadata import PARENT, STUDY
-from deepracer_exp.tracking.metrics import trial_metrics
+from deepracer_exp.tracking.mlflow_metrics import trial_metrics
 from deepracer_exp.tracking.projector import Projector
 from deepracer_exp.tracking.study_run import TRIAL, end_trial_run, open_trial_run
 from deepracer_exp.tracking.tracking_file import Status
 from deepracer_exp.training.budget import RunEnded
 from deepracer_exp.training.plan import TrainPlan, plan_resume
-from deepracer_exp.training.result import TrainResult
 from deepracer_exp.training.run import copy_run, run_training
+from deepracer_exp.training.train_result import TrainResult
 from deepracer_exp.training.trainer import Callback, Trainer
 
 from .claims import TrialClaims

@@ -16,8 +16,8 @@ from deepracer_exp.sweeps.search.pruners import build_pruner
 from deepracer_exp.sweeps.search.samplers import build_sampler
 from deepracer_exp.sweeps.trial import Interrupted, Trial
 from deepracer_exp.tracking.projector import Projector
-from deepracer_exp.training.result import TakenOver
 from deepracer_exp.training.signals import Interruption
+from deepracer_exp.training.train_result import TakenOver
 
 from .claims import Claim, TrialClaims, report_results
 from .lease import Lease

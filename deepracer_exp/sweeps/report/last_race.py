@@ -11,7 +11,7 @@ from deepracer_exp.runs.best_run import BestOfSweep, write_best_of_sweep
 from deepracer_exp.runs.run_result import BOTH, of_conditions
 from deepracer_exp.sweeps.search.objectives import shown, shown_or_dash
 
-from .best import complete_trials
+from .best_trial import complete_trials
 
 LAST_RACE = "last_race"
 """Attribute of a study in Optuna: the results of the policies, and the number of complete trials at that time."""

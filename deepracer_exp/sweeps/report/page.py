@@ -27,10 +27,10 @@ from deepracer_exp.sweeps.search.objectives import (
 )
 from deepracer_exp.sweeps.trial import Trial
 
-from .best import best_line, best_run, best_shown, best_trial, complete_trials, over_seeds, reranked
+from .best_trial import best_line, best_run, best_shown, best_trial, complete_trials, over_seeds, reranked
 from .figures import FEWEST_COMPLETE, figures, importances, least_width, narrowed
-from .labels import ENDINGS, duration, ending_of, ending_words, parameter, short_keys, steps
 from .last_race import last_race, race_rows
+from .wording import ENDINGS, duration, ending_of, ending_words, parameter, short_keys, steps
 
 _MOST_ROWS = 300
 _MOST_FAILURES = 20

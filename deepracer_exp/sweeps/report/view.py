@@ -20,7 +20,7 @@ from deepracer_exp.sweeps.search.objectives import NONE, cost, shown, shown_valu
 from deepracer_exp.sweeps.trial import Trial
 from deepracer_exp.training.display import LINE_COLUMNS, sparkline
 
-from .labels import duration, ending_words, parameter, short_keys
+from .wording import duration, ending_words, parameter, short_keys
 
 _POINTS = 16
 """Characters of a sparkline."""

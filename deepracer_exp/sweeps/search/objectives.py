@@ -10,7 +10,7 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.run_result import of_conditions, with_unit
 
 if TYPE_CHECKING:
-    from deepracer_exp.evaluation.result import Evaluation
+    from deepracer_exp.evaluation.results import Evaluation
 
 NONE = "\N{EN DASH}"
 """Shown where there is no value."""
@@ -88,7 +88,7 @@ def objective_values(evaluation: "Evaluation", objectives: Sequence[str], trial_
     may take, and more the less of the lap it drives, because samplers need a number for it as well. Its zig-zag counts
     as more than that of any lap for the same reason: a car that does not drive does not swerve.
     """
-    from deepracer_exp.evaluation.result import USUAL
+    from deepracer_exp.evaluation.results import USUAL
 
     usual = evaluation.on(USUAL)
     fallback = without_lap(usual.completion, trial_time_s)

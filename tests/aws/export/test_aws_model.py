@@ -15,7 +15,7 @@ from deepracer_exp.aws.export.aws_model import aws_model, services_kind
 from deepracer_exp.aws.models.model_metadata import NEURAL_NETWORKS, ModelMetadata, read_model_metadata
 from deepracer_exp.aws.models.tf_checkpoint import read_index, read_tensors
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.config.custom_files import sensor_overrides
+from deepracer_exp.config.custom_files.model_files import sensor_overrides
 from deepracer_exp.config.named import network_overrides
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import observation_shape

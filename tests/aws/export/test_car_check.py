@@ -15,9 +15,9 @@ from deepracer_exp.aws.export.car_export import CarArchive, car_actions
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment
 from deepracer_exp.config.driving import CameraConfig
 from deepracer_exp.env.action_space import DiscreteActions
-from deepracer_exp.evaluation.evaluate import CAR, SIMULATOR
 from deepracer_exp.evaluation.race_protocol import Attempt
-from deepracer_exp.evaluation.result import USUAL, Evaluation, TrialGroup
+from deepracer_exp.evaluation.results import USUAL, Evaluation, TrialGroup
+from deepracer_exp.evaluation.run_evaluation import CAR, SIMULATOR
 from deepracer_exp.evaluation.zigzag import ZigZag
 from deepracer_exp.reports.pages.picture_changes import CHANGES, pictures_sheet, spread_out, try_pictures
 

@@ -7,15 +7,15 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
+
+from deepracer_exp.aws.logs.reader import read_recording
+from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.others.placement import (
     PlacedOthers,
     Placement,
     read_placements,
     rebuild_poses,
 )
-
-from deepracer_exp.aws.logs.reader import read_recording
-from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.reports.charts.others_charts import crash_free, crash_places, crashes_by_object, overtakes
 from deepracer_exp.reports.findings import findings
 from deepracer_exp.reports.pages.log_report import LogPage, draw_sections

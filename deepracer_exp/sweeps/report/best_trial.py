@@ -17,7 +17,7 @@ from deepracer_exp.runs.run_result import FRESH_LAPS, SWEEP_LAPS
 from deepracer_exp.sweeps.search.objectives import MEASURES, NONE, cost, objectives_of, shown, shown_values
 from deepracer_exp.sweeps.trial import SeedRun, Trial
 
-from .labels import parameter
+from .wording import parameter
 
 _MOST_ROWS = 20
 

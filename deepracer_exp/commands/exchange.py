@@ -92,8 +92,8 @@ def _import(args: argparse.Namespace) -> int:
         raise BadInput(f"{args.overrides[0]}: {args.path} holds no model; accepted for one: KEY=VALUE")
 
     from deepracer_exp.config.compose import compose_experiment
-    from deepracer_exp.config.custom_files import KEY, read_custom_files
-    from deepracer_exp.config.imported_options import import_files
+    from deepracer_exp.config.custom_files.imported_options import import_files
+    from deepracer_exp.config.custom_files.model_files import KEY, read_custom_files
     from deepracer_exp.config.overrides import override_line
     from deepracer_exp.training.plan import plan_training
 

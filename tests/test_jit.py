@@ -10,12 +10,13 @@ from pathlib import Path
 import pytest
 
 import deepracer_exp
-from deepracer_exp import cache, compiled
+from deepracer_exp import cache
+from deepracer_exp import jit as compiled
 
 BRAKES = """
     import numpy as np
 
-    from deepracer_exp.compiled import njit
+    from deepracer_exp.jit import njit
 
     FRICTION = {friction}
     SHARES = {shares}
@@ -26,7 +27,7 @@ BRAKES = """
         return {factor} * speed
 """
 CAR = """
-    from deepracer_exp.compiled import njit
+    from deepracer_exp.jit import njit
     from deepracer_exp.sim.brakes import FRICTION, LIMITS, SHARES, slowed
 
     @njit(cache=True)
@@ -166,7 +167,7 @@ def test_the_folder_is_named_by_all_files_of_which_compiled_functions_use_someth
         for file in top.rglob("*.py")
         if cache.has_compiled_functions(file.read_bytes())
     }
-    assert {"deepracer_exp.compiled", "deepracer_exp.sim.tyres"} <= hashed.keys()
+    assert {"deepracer_exp.jit", "deepracer_exp.sim.tyres"} <= hashed.keys()
     others = set()
     for name, tree in hashed.items():
         used = used_by_compiled_functions(tree)

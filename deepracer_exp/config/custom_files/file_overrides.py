@@ -5,11 +5,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from deepracer_exp.config.overrides import first_given, key_of, override_line, parse_single
 from deepracer_exp.errors import BadInput
 
-from .custom_files import FRAMES, KEY, SAC_DIFFERS, CustomFiles, read_custom_files
 from .job_overrides import job_overrides
-from .overrides import first_given, key_of, override_line, parse_single
+from .model_files import FRAMES, KEY, SAC_DIFFERS, CustomFiles, read_custom_files
 
 
 @dataclass(frozen=True)

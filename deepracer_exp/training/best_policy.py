@@ -5,7 +5,7 @@ from typing import Any
 
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.setup import RaceSetup
-from deepracer_exp.evaluation.result import Evaluation, Rank
+from deepracer_exp.evaluation.results import Evaluation, Rank
 
 from .metrics import NOT_EVALUATED, Finished, Ranking, eval_columns
 

@@ -7,10 +7,9 @@ from dataclasses import replace
 from pydantic import TypeAdapter
 
 from deepracer_exp.aws.models.job_settings import H2B_KEYS, OA_KEYS, JobSettings
+from deepracer_exp.config.overrides import first_given, override_line
+from deepracer_exp.config.racing import ALONE, BotsConfig, BoxPosition, RaceConfig
 from deepracer_exp.errors import BadInput
-
-from .overrides import first_given, override_line
-from .race import ALONE, BotsConfig, BoxPosition, RaceConfig
 
 ENV_DEFAULTS = {
     "NUMBER_OF_OBSTACLES": "6",

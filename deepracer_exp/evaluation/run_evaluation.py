@@ -26,15 +26,15 @@ from deepracer_exp.runs.checkpoint_files import checkpoint_words
 from deepracer_exp.runs.checkpoints import StoredPolicy
 from deepracer_exp.runs.run_files import EVALUATIONS, FILMS
 from deepracer_exp.tracking.delivery import deliver_evaluation
-from deepracer_exp.tracking.metrics import evaluate_metric, track_labels
+from deepracer_exp.tracking.mlflow_metrics import evaluate_metric, track_labels
 from deepracer_exp.tracks.boards import Standing, standings, what_it_sees
 
 from .evaluator import Evaluator
 from .film import LapRecorder, best_attempt
 from .plan import EvaluatePlan
 from .race_protocol import RaceProtocol
-from .result import CONFIDENCE, NOTHING, USUAL, Evaluation, number, zigzag_columns
-from .trace import TraceRecorder
+from .results import CONFIDENCE, NOTHING, USUAL, Evaluation, number, zigzag_columns
+from .trace_recorder import TraceRecorder
 
 _TIMES = ("lap s", "median", "best", "std", "score s")
 _MINOR = ("median", "std", "score s", "zig-zag /m")

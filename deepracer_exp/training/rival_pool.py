@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from deepracer_exp.config.race import NEWEST, RivalsConfig
+from deepracer_exp.config.racing import NEWEST, RivalsConfig
 from deepracer_exp.env.others.head_to_head import Rivals, Weights, rival_setup, weights_of
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.runs.stored_run import StoredRun

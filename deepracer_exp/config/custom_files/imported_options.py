@@ -10,15 +10,15 @@ from typing import Any
 import yaml
 
 from deepracer_exp.aws.models.model_metadata import Action
+from deepracer_exp.config.experiment import safe_name
+from deepracer_exp.config.options import conf_dirs
+from deepracer_exp.config.overrides import parse_single
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import read_bytes
 
-from .custom_files import FRAMES, CustomFiles
-from .experiment import safe_name
 from .file_overrides import car_override
 from .job_overrides import job_overrides
-from .options import conf_dirs
-from .overrides import parse_single
+from .model_files import FRAMES, CustomFiles
 
 _GROUPS = {
     "reward_function.py": "reward",

@@ -9,7 +9,7 @@ from deepracer_exp.runs.listing import Row, iso_time
 
 from .calls import pages
 from .metadata import END_TAG, HOST, NAME, STUDY, USER_NOTE
-from .metrics import BEST, METRICS
+from .mlflow_metrics import BEST, METRICS
 from .store import open_client
 from .study_run import KIND, TRIAL
 

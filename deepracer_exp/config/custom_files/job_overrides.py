@@ -6,10 +6,10 @@ from collections.abc import Iterator, Mapping
 from deepracer_exp.aws.models.job_settings import FILE_KEYS, H2B_KEYS, OA_KEYS, JobSettings
 from deepracer_exp.aws.worlds.catalogue import find_world, worlds
 from deepracer_exp.aws.worlds.routes import runs_clockwise, world_rows
+from deepracer_exp.config.overrides import first_given, override_line
 from deepracer_exp.errors import BadInput, nearest
 
 from .job_race import race_overrides
-from .overrides import first_given, override_line
 
 _SECOND_CAR = ("HEAD_TO_MODEL", "F1")
 """Types of race against other models, whose number the service reads elsewhere."""

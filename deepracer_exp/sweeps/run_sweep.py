@@ -28,6 +28,14 @@ from deepracer_exp.env.setup import build_setup
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.reward import RewardFunction
 from deepracer_exp.runs.lineage import refuse_other_networks
+from deepracer_exp.sweeps.report.best_trial import (
+    best_line,
+    best_shown,
+    best_trial,
+    best_values,
+    complete_trials,
+    write_best,
+)
 from deepracer_exp.tracking.store import Store, resolve_store
 from deepracer_exp.tracking.study_run import Progress, StudyRun
 from deepracer_exp.tracking.tracking_file import Status
@@ -45,14 +53,6 @@ from .queue.ray_launcher import RayLauncher
 from .queue.storage import open_storage, patiently, resolve_database
 from .queue.study import open_study
 from .queue.worker_config import RUN_ID, Parent, WorkerConfig, plan_trial
-from .report.best import (
-    best_line,
-    best_shown,
-    best_trial,
-    best_values,
-    complete_trials,
-    write_best,
-)
 from .report.last_race import LAST_RACE, write_submitted
 from .report.view import SweepView
 from .search.pruners import build_pruner

@@ -16,7 +16,7 @@ from deepracer_exp.agents.service_weights import (
 )
 from deepracer_exp.aws.models.archive import StoredModel
 from deepracer_exp.aws.models.model_metadata import NEURAL_NETWORKS
-from deepracer_exp.config.custom_files import SAC_DIFFERS, CustomFiles
+from deepracer_exp.config.custom_files.model_files import SAC_DIFFERS, CustomFiles
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.learning import CNNConfig, SACConfig
 from deepracer_exp.config.named import network_overrides, services_layers
