@@ -83,7 +83,7 @@ def cut_windows(
     """Cut every episode into windows of `steps`: where the car begins to move, and from a whole warm-up later on.
 
     Args:
-        recorded: the steps of a `aws.logs.recording.Recording`.
+        recorded: the steps of a `aws.logs.recorded.Recording`.
         front_point_m: how far the recorded point is ahead of the chassis origin.
         steps: control steps to predict.
         every: rows from one window to the next.

@@ -164,7 +164,7 @@ class RunTables:
 
     @cached_property
     def steps(self) -> pd.DataFrame:
-        """One row per control step of the trace, columns `aws.logs.recording.STEP_COLUMNS`."""
+        """One row per control step of the trace, columns `aws.logs.recorded.STEP_COLUMNS`."""
         return read_run_recording(self.path).recording.steps
 
 

@@ -102,7 +102,7 @@ class DeepRacerEnv(gym.Env[Observed, Any]):
 class DeepRacerVectorEnv(VectorEnv[Observed, NDArray[Any], NDArray[Any]]):
     """Many cars, stepped together; a car whose episode ended starts a new one in the same step.
 
-    `infos` holds arrays `progress` and `episode_status` (codes of `env.trace.EPISODE_STATUS`) of the poses
+    `infos` holds arrays `progress` and `episode_status` (codes of `env.trace_columns.EPISODE_STATUS`) of the poses
     before the step. In a step that ended episodes it also holds, as Gymnasium's own vector environments do, `final_obs`
     (objects: an observation, or None) with the mask `_final_obs`, and `final_info` with `_final_info`.
     """

@@ -59,7 +59,7 @@ class Race:
         reward: of the last step, (N,), float64.
         terminated: the last step ended the episode, (N,), bool.
         truncated: the last step cut the episode off, see `StepResult`, (N,), bool.
-        trace: one row per car for the last step, columns `env.trace.PACKED_COLUMNS`, among others `OTHERS_PACKED`, and
+        trace: one row per car for the last step, columns `env.trace_columns.PACKED_COLUMNS`, among others `OTHERS_PACKED`, and
             against a rival `RIVAL_PACKED`, (N, C), float64.
         others: the boxes and bots on the road; None: the cars are alone.
     """

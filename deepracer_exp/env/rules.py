@@ -136,7 +136,7 @@ class StepResult:
     off_track: Bools
     """Whether no wheel is on the road."""
     status: NDArray[np.int64]
-    """Codes of `env.trace.STATUS_CODE`."""
+    """Codes of `env.trace_columns.STATUS_CODE`."""
     terminated: Bools
     truncated: Bools
     """Whether the episode was cut off although the car could drive on: at `episode.max_steps`, or at the end of a

@@ -23,7 +23,7 @@ class DeepRacerVecEnv(VecEnv):
     """A `DeepRacerVectorEnv` behind Stable-Baselines3's interface: all cars in this process, stepped together.
 
     Where an episode ended, the step's info has `terminal_observation`, `TimeLimit.truncated`, `progress` in per cent
-    and `episode_status` (code of `env.trace.EPISODE_STATUS`); elsewhere it is empty.
+    and `episode_status` (code of `env.trace_columns.EPISODE_STATUS`); elsewhere it is empty.
     """
 
     def __init__(

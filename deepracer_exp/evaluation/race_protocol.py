@@ -102,7 +102,7 @@ class RaceProtocol:
     def step(self, status: NDArray[np.int64], progress: Floats) -> PutBack:
         """Process one control step and return the cars to put back.
 
-        Status codes are those of `env.trace.STATUS_CODE`, progress is in per cent of the lap, (N,) each.
+        Status codes are those of `env.trace_columns.STATUS_CODE`, progress is in per cent of the lap, (N,) each.
         """
         self._steps += 1
         driven_s = lap_clock_s(self._steps, self._period_s)

@@ -77,7 +77,7 @@ def pauses_left_s(
     it is held have what is left of it.
 
     Args:
-        status: codes of `env.trace.STATUS_CODE`, (n,), by episode and step.
+        status: codes of `env.trace_columns.STATUS_CODE`, (n,), by episode and step.
         episode: of each row, (n,).
         penalty_s: by status.
         period_s: simulated seconds of a control step.

@@ -37,7 +37,7 @@ CONSOLE_CURE = "smaller steering angles in the action space"
 class ZigZag:
     """Sums of a car's zig-zag on straights; two of them can be added.
 
-    A straight is a sector of the course without a bend (`sectors.sectors_of`), whatever line the car takes on it;
+    A straight is a sector of the course without a bend (`tracks.sectors.sectors_of`), whatever line the car takes on it;
     standing starts count like the rest of a lap. The first change of steering each time a straight is driven is not
     counted: the way from a bend to the left into one to the right needs it, and many straights are short.
     """

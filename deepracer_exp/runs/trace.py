@@ -208,7 +208,7 @@ def missing_trace(run: Path) -> str:
 
 
 def read_others(folder: Path, least_iteration: int = 0) -> pa.Table | None:
-    """Read the boxes, bots and rivals of a trace, `env.placement.SCHEMA`; None where the car was alone.
+    """Read the boxes, bots and rivals of a trace, `env.others.placement.SCHEMA`; None where the car was alone.
 
     Raises:
         BadInput: a file is incomplete or of another kind.

@@ -124,7 +124,7 @@ class RunMetrics:
     def enter(self, trace: np.ndarray) -> tuple[np.ndarray, Finished]:
         """Number and count the episodes of a batch.
 
-        `trace` has rows of `env.trace.PACKED_COLUMNS`, shape (cars, T, C), time running along T.
+        `trace` has rows of `env.trace_columns.PACKED_COLUMNS`, shape (cars, T, C), time running along T.
 
         Returns:
             The rows in the order of episode and step, with the run's own episode numbers, shape (cars * T, C); and

@@ -84,7 +84,7 @@ def run_training(
         plan: of `plan_training`, `plan_clone` or `plan_resume`.
         console: shows the progress; None: nothing is shown.
         callbacks: called beside the standard ones, see `standard_callbacks`.
-        report: makes pictures and pages of the run, `reports.run_page.RunReport`; None: there are none.
+        report: makes pictures and pages of the run, `reports.pages.run_page.RunReport`; None: there are none.
         run_name: of the run in MLflow; None: from the reward function and the time.
         tags: of the run in MLflow, beside its own.
         created: called with the folder of a new run before it is recorded anywhere else.

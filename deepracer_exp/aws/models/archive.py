@@ -141,7 +141,7 @@ def checkpoint_names(path: str, raw: bytes) -> dict[str, str]:
 
 
 def _read(files: _Files, checkpoint: str) -> StoredModel:
-    weights = [name for name in files.sizes if name.endswith((INDEX, ".pb"))]  # as in `commands.files`
+    weights = [name for name in files.sizes if name.endswith((INDEX, ".pb"))]  # as in `commands.exchange`
     whole = [
         name for name in weights if name.endswith(INDEX) and f"{name[: -len(INDEX)]}{DATA}" in files.sizes
     ]

@@ -31,7 +31,7 @@ class Manner(NamedTuple):
 
 
 class Bots(NamedTuple):
-    """The bots of N cars: arrays with a row per car, changed in place; see `sim.others.Others`."""
+    """The bots of N cars: arrays with a row per car, changed in place; see `env.others.boxes_and_bots.Others`."""
 
     start_m: np.ndarray
     lane: np.ndarray

@@ -97,7 +97,7 @@ def draw_placements(
         race: how many there are, and how they are placed.
         length_m: of the centre lines, (n,).
         episode: their numbers among those of their cars, from 0, (n,).
-        seeds: of the episodes, (n,); see `sim.placement.episode_seeds`.
+        seeds: of the episodes, (n,); see `env.others.service_draws.episode_seeds`.
     """
     boxes, bots = race.boxes, race.bots
     places_m = np.empty((len(seeds), boxes.count + bots.count))

@@ -281,7 +281,7 @@ class RaceOthers:
 def with_crashes(status: NDArray[np.int64], has_hit: Bools, at_fault: Bools) -> NDArray[np.int64]:
     """Return status codes after crashes, (N,).
 
-    Each of the arguments is (N,); `status` has the codes of `env.trace.STATUS_CODE` without crashes.
+    Each of the arguments is (N,); `status` has the codes of `env.trace_columns.STATUS_CODE` without crashes.
 
     A car at fault has crashed. One that is not drives on, and leaving the road, driving backwards or standing in that
     step does not count either. The end of a lap and of the time have priority (deepracer-simapp,

@@ -43,7 +43,7 @@ class RecordedParams:
         """Find the direction of each episode.
 
         Args:
-            steps: `aws.logs.recording.STEP_COLUMNS`, grouped by episode and in the order of time.
+            steps: `aws.logs.recorded.STEP_COLUMNS`, grouped by episode and in the order of time.
             episode: number of each row's episode, non-decreasing, (n,).
             course: on which all of them were driven.
             car: with the positions of its wheels and front.
