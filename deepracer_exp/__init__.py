@@ -63,10 +63,10 @@ _MODULES = {
     "env.observation": ("ObservationPart",),
     "env.race_env": ("RaceEnv",),
     "errors": ("BadInput", "RunFailed"),
-    "evaluation.result": ("Evaluation",),
-    "stopping.rules": ("Decision", "StoppingRule"),
+    "evaluation.results": ("Evaluation",),
+    "training.stopping.stopping_rules": ("Decision", "StoppingRule"),
     "tracking.tracker": ("Tracker",),
-    "training.result": ("TrainResult",),
+    "training.train_result": ("TrainResult",),
     "training.trainer": ("Callback", "Trainer"),
 }
 """The module of each class; a worker process imports only those whose classes the user's own classes derive from."""

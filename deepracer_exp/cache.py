@@ -60,4 +60,4 @@ def compiled_folder() -> Path | None:
 
 def has_compiled_functions(source: bytes) -> bool:
     """Return whether a file of this package has functions that are compiled, by its imports."""
-    return re.search(rb"^(import numba|from deepracer_exp\.compiled)\b", source, re.MULTILINE) is not None
+    return re.search(rb"^(import numba|from deepracer_exp\.jit)\b", source, re.MULTILINE) is not None

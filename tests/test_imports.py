@@ -26,13 +26,13 @@ def test_a_sweep_starts_its_workers_before_it_imports_pytorch_or_pandas(tmp_path
     code = """
 import sys
 from deepracer_exp.cli import main
-from deepracer_exp.sweeps import sweep
+from deepracer_exp.sweeps import run_sweep
 
 def run(driver, interruption):
     print({"torch", "pandas"} & sys.modules.keys())
     return 130
 
-sweep.Driver.run = run
+run_sweep.Driver.run = run
 main(["sweep", "experiment=tiny", "algorithm.lr=1e-3,1e-4", "tracking=off"])
 """
     done = subprocess.run(
@@ -59,7 +59,7 @@ def state_of_libraries(modules: Sequence[str], compared: Sequence[str] = ()) -> 
 def test_nothing_of_other_libraries_differs_from_a_process_without_this_package():
     ours = [
         f"deepracer_exp.{name}"
-        for name in ("training.run", "collectors.worker", "api", "sweeps.sweep", "cli")
+        for name in ("training.run", "collectors.car_worker", "api", "sweeps.run_sweep", "cli")
     ]
     # What a user may have imported; threadpoolctl, because it sets a variable of the environment.
     theirs = ["torch._dynamo", "tensordict", "pandas", "threadpoolctl"]

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 import deepracer_exp
-from deepracer_exp import cache
-from deepracer_exp import jit as compiled
+from deepracer_exp import cache, jit
 
 BRAKES = """
     import numpy as np
@@ -65,11 +64,11 @@ def package(tmp_path) -> Path:
     (package / "sim").mkdir(parents=True)
     for place in (package, package / "sim"):
         (place / "__init__.py").touch()
-    for module in (compiled, cache):
+    for module in (jit, cache):
         file = Path(module.__file__)
         (package / file.name).write_text(file.read_text())
     (package / "sim" / "brakes.py").write_text(textwrap.dedent(BRAKES).format(**VALUES))
-    (package / "sim" / "car.py").write_text(textwrap.dedent(CAR))
+    (package / "sim" / "mujoco_model.py").write_text(textwrap.dedent(CAR))
     return package
 
 
@@ -95,7 +94,7 @@ def test_code_on_disk_is_that_of_all_files_it_was_compiled_from(package, changed
 
 def test_code_is_kept_where_numba_is_asked_to_keep_it(package, tmp_path):
     assert driven(package, NUMBA_CACHE_DIR=str(tmp_path / "numba")) == (3.0, 0)
-    assert list((tmp_path / "numba").glob("compiled-*/*/car.drive-*.nbi"))
+    assert list((tmp_path / "numba").glob("compiled-*/*/mujoco_model.drive-*.nbi"))
     assert not (tmp_path / "cache").exists()
 
 

@@ -127,6 +127,7 @@ class ObservationConfig:
     lookahead_scale_m: Divisor
     speed_scale_mps: Divisor
     yaw_rate_scale_radps: Divisor
+    sliding: bool = False
     parts: tuple[OwnClass, ...] = ()
     next_objects: Annotated[int, Field(ge=0, le=20)] = 0
     next_objects_reach_m: Divisor = 5.0

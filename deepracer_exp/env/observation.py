@@ -10,6 +10,7 @@ from deepracer_exp.config.driving import ObservationConfig, ObservationShape
 from deepracer_exp.config.own_class import OwnClass, build_own
 from deepracer_exp.errors import BadInput, reading
 from deepracer_exp.jit import compiled
+from deepracer_exp.sim.batch import CarState
 from deepracer_exp.tracks.segments import pose_at
 from deepracer_exp.tracks.track import TrackIndex, Tracks
 
@@ -17,6 +18,8 @@ from .state import Measures
 
 OTHERS = ("gap", "side", "closing", "bot")
 """Features of each of the next boxes and bots, see `RaceOthers.features`."""
+SLIDING = ("side_speed", "wheel_angle")
+"""Features of a car that slides: its speed to the left, and the angle that its front wheels have reached."""
 _ABSENT = np.array([1, 0, 0, 0], np.float32)
 """Values of these features where there is no box or bot."""
 
@@ -101,6 +104,7 @@ def _names(config: ObservationConfig, parts: Sequence[ObservationPart]) -> tuple
         "last_steering",
         "last_speed",
         *(f"ahead_{axis}_{distance:g}" for distance in config.lookahead_m for axis in "xy"),
+        *(SLIDING if config.sliding else ()),
         *(f"next_{number}_{what}" for number in range(1, config.next_objects + 1) for what in OTHERS),
         *(name for part in parts for name in part.names),
     )
@@ -113,7 +117,8 @@ class Features:
     and `heading_error_cos` of the car's yaw against the centre line; `speed` and `yaw_rate` as measured;
     `last_steering` and `last_speed` as last commanded, over the largest of the action space; then for each
     look-ahead distance `ahead_x_D` and `ahead_y_D`: the centre line's point D metres further on in the frame
-    of the car's front point, x forward and y to the left; then `next_N_gap` and so on of the next boxes and bots
+    of the car's front point, x forward and y to the left; then, with `sliding`, `side_speed` to the left of the heading
+    and `wheel_angle` over the largest of the action space; then `next_N_gap` and so on of the next boxes and bots
     (`RaceOthers.features`); then those of the parts.
     """
 
@@ -143,6 +148,7 @@ class Features:
         track_index: TrackIndex,
         steering_deg: np.ndarray,
         commanded_mps: np.ndarray,
+        car: CarState,
         others: np.ndarray | None = None,
     ) -> np.ndarray:
         """Return the features, shape (N, len(names)), float32.
@@ -152,6 +158,7 @@ class Features:
             track_index: index of each car's track, (N,).
             steering_deg: last commanded steering (N,).
             commanded_mps: last commanded speed (N,).
+            car: motion of each car, as measured for `now`.
             others: features of the next boxes and bots, (N, len(OTHERS) * next_objects); None: there are none.
         """
         config = self._config
@@ -172,6 +179,10 @@ class Features:
         center, closed = self._tracks.lines[0], self._tracks.closed
         _features(observed, self._scales, center, closed, self._ahead_ndist, out)
         end = 7 + 2 * len(config.lookahead_m)
+        if config.sliding:
+            out[:, end] = car.lateral_mps / self._scales.speed_mps
+            out[:, end + 1] = np.degrees(car.wheel_angle_rad) / self._scales.steering_deg
+            end += len(SLIDING)
         if config.next_objects:
             begin, end = end, end + len(OTHERS) * config.next_objects
             out[:, begin:end] = np.tile(_ABSENT, config.next_objects) if others is None else others

@@ -15,7 +15,7 @@ from deepracer_exp.env.randomization.real_car_randomization import RealCarRandom
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.rewards.prints import RewardPrints
 from deepracer_exp.rewards.reward import RewardFunction
-from deepracer_exp.sim.batch import CarBatch
+from deepracer_exp.sim.batch import CarBatch, CarState
 from deepracer_exp.tracks.lanes import INNER, OUTER, Lanes
 from deepracer_exp.tracks.track import Pose
 
@@ -59,8 +59,8 @@ class Race:
         reward: of the last step, (N,), float64.
         terminated: the last step ended the episode, (N,), bool.
         truncated: the last step cut the episode off, see `StepResult`, (N,), bool.
-        trace: one row per car for the last step, columns `env.trace_columns.PACKED_COLUMNS`, among others `OTHERS_PACKED`, and
-            against a rival `RIVAL_PACKED`, (N, C), float64.
+        trace: one row per car for the last step, columns `env.trace_columns.PACKED_COLUMNS`, among others
+            `OTHERS_PACKED`, and against a rival `RIVAL_PACKED`, (N, C), float64.
         others: the boxes and bots on the road; None: the cars are alone.
     """
 
@@ -426,7 +426,7 @@ class Race:
     def _observe(self) -> None:
         """Measure all cars and compute the policy's observations."""
         state = self._batch.read()
-        features = self._features_of(self.rules.measure(state), self._everyone)
+        features = self._features_of(self.rules.measure(state), state, self._everyone)
         self.observation = self.randomization.disturb_observation(features, self.observation)
         if self._pictures is not None:
             self.pixels = self._pictures.next(
@@ -450,7 +450,7 @@ class Race:
         # The caller holds the terminal observation: it must not change.
         self.observation = self.observation.copy()
         self.observation[ids] = self.randomization.disturb_first_observation(
-            ids, self._features_of(started, ids)
+            ids, self._features_of(started, state, ids)
         )
         if self._pictures is not None:
             self.pixels = self.pixels.copy()
@@ -467,11 +467,16 @@ class Race:
         if self._lidar is not None and self.others is not None:
             self._lidar.show(ids, self.others.boxes(ids))
 
-    def _features_of(self, measures: Measures, ids: np.ndarray) -> np.ndarray:
+    def _features_of(self, measures: Measures, state: CarState, ids: np.ndarray) -> np.ndarray:
         others = self.others
         ahead = None if others is None or not self._sees_others else others.features(ids, measures)
         return self._features.compute(
-            measures, self.rules.track_index[ids], self._steering_deg[ids], self._commanded_mps[ids], ahead
+            measures,
+            self.rules.track_index[ids],
+            self._steering_deg[ids],
+            self._commanded_mps[ids],
+            state,
+            ahead,
         )
 
     def _lost_car(self, error: RunFailed, action: np.ndarray) -> RunFailed:

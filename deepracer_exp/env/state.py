@@ -16,6 +16,8 @@ from deepracer_exp.tracks.track import TrackIndex, Tracks
 
 Floats = NDArray[np.float64]
 
+STILL_M = 0.01
+"""Movement below which a car has no direction of travel."""
 _PAIRS = ("front", "closest_waypoints")
 """Arrays with two numbers per car."""
 _TYPES = {"closest_waypoints": np.int64, "is_left": np.bool_}

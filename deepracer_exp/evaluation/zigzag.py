@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from deepracer_exp.env.state import STILL_M
 from deepracer_exp.tracks.sectors import sector_at, sectors_of
 from deepracer_exp.tracks.track import Track
 
@@ -18,8 +19,6 @@ AROUND = 7
 """Control steps before and after, over which a car's direction is averaged: about a second in all."""
 DRIVES = ("", "in_progress", "lap_complete")
 """Status of the rows in which the car drives; formats without a status have none."""
-STILL_M = 0.01
-"""Movement below which a car has no direction of travel."""
 PASS_M = 1.0
 """Rows further apart are not of one pass: the car was moved."""
 ZIGZAG_PER_M = 1.0
@@ -37,8 +36,8 @@ CONSOLE_CURE = "smaller steering angles in the action space"
 class ZigZag:
     """Sums of a car's zig-zag on straights; two of them can be added.
 
-    A straight is a sector of the course without a bend (`tracks.sectors.sectors_of`), whatever line the car takes on it;
-    standing starts count like the rest of a lap. The first change of steering each time a straight is driven is not
+    A straight is a sector of the course without a bend (`tracks.sectors.sectors_of`), whatever line the car takes on
+    it; standing starts count like the rest of a lap. The first change of steering each time a straight is driven is not
     counted: the way from a bend to the left into one to the right needs it, and many straights are short.
     """
 

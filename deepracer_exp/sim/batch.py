@@ -44,6 +44,8 @@ class CarState(NamedTuple):
     lateral_mps: Floats
     """Speed of the chassis origin to the left of the heading."""
     yaw_rate_radps: Floats
+    wheel_angle_rad: Floats
+    """Angle of the front wheels to the left, without the car's trim."""
 
 
 def cores() -> int:
@@ -137,7 +139,9 @@ class CarBatch:
         """Return position and motion of the cars `ids`, (n,) each; None: of all."""
         ids = self._everyone if ids is None else ids
         x_m, y_m, cos, sin, *motion = _read(ids, self._qpos, self._qvel, self.car.com_x_m)
-        return CarState(x_m, y_m, np.arctan2(sin, cos), *motion)
+        ahead_mps, left_mps, rate_radps = motion
+        wheels_rad = self._drives["steering_rad"][ids, 0]
+        return CarState(x_m, y_m, np.arctan2(sin, cos), ahead_mps, left_mps, rate_radps, wheels_rad)
 
     @property
     def state(self) -> Floats:

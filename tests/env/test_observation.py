@@ -97,3 +97,22 @@ def test_every_feature_is_documented(race_of):
     page = (Path(__file__).parents[2] / "docs/observation.md").read_text()
     named = set(re.findall(r"^\| `(\w+)`", page, re.MULTILINE))
     assert named == {re.sub(r"_[\d.]+$", "_D", name) for name in race_of().feature_names}
+
+
+def test_a_sliding_car_sees_its_speed_to_the_side_and_the_angle_of_its_wheels(race_of):
+    race = race_of("car=deepracer_v4", "action_space=continuous", "observation.sliding=true", n_cars=2)
+    assert race.feature_names[-2:] == ("side_speed", "wheel_angle")
+    angles = []
+    for _ in range(8):
+        race.step(np.array([[1.0, 1.0], [-1.0, 1.0]]))
+        angles.append(features(race)["wheel_angle"].copy())
+    seen, state = features(race), race._batch.read()
+    np.testing.assert_allclose(seen["side_speed"], state.lateral_mps / 4, rtol=1e-6)
+    np.testing.assert_allclose(seen["wheel_angle"], np.degrees(state.wheel_angle_rad) / 30, rtol=1e-6)
+    left, right = np.array(angles).T
+    # The command is full left at once; the wheels of this car need half a second for two thirds of the way.
+    assert seen["last_steering"][0] == 1.0
+    assert (np.diff(left) > 0).all()
+    assert 0.5 < left[-1] < 0.9
+    np.testing.assert_allclose(right, -left)
+    assert seen["side_speed"][0] * seen["side_speed"][1] < 0

@@ -125,6 +125,7 @@ def situations(
         speed_mps=where.speed_mps,
         lateral_mps=still,
         yaw_rate_radps=still,
+        wheel_angle_rad=still,
     )
     steps_before = np.maximum(where.steps - 1 - earlier, 0)
     rules = RaceRules(setup, n)

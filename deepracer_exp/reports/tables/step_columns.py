@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from deepracer_exp.aws.logs.recorded import TRAINING
 from deepracer_exp.env.rules import lap_clock_s
-from deepracer_exp.evaluation.zigzag import STILL_M
+from deepracer_exp.env.state import STILL_M
 from deepracer_exp.jit import njit
 from deepracer_exp.tracks.track import Track
 
