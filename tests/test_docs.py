@@ -108,10 +108,10 @@ def test_the_picture_of_the_layers_shows_those_that_are_checked():
     contract = re.search(
         r"^layers = \[(.*?)^\]", (ROOT / "pyproject.toml").read_text(), re.DOTALL | re.MULTILINE
     )
-    rows = [re.findall(r"\w+", row) for row in re.findall(r'"(.*)"', contract.group(1))]
-    packages = [[name for name in row if (ROOT / "deepracer_exp" / name).is_dir()] for row in rows]
-    drawn = re.findall(r'font-weight="bold"[^>]*>(\w+)<', (ROOT / "docs/images/layers.svg").read_text())
-    shown = [name for name in drawn if (ROOT / "deepracer_exp" / name).is_dir()]
+    rows = [re.findall(r"[\w.]+", row) for row in re.findall(r'"(.*)"', contract.group(1))]
+    package = {name: ROOT / "deepracer_exp" / name.replace(".", "/") for row in rows for name in row}
+    packages = [[name for name in row if package[name].is_dir()] for row in rows]
+    shown = re.findall(r'font-weight="bold"[^>]*>([\w.]+)<', (ROOT / "docs/images/layers.svg").read_text())
     assert sorted(shown) == sorted(name for row in packages for name in row)
     position = {name: index for index, row in enumerate(packages) for name in row}
     assert [position[name] for name in shown] == sorted(position[name] for name in shown)
