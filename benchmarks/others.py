@@ -73,7 +73,7 @@ def measure(path: Path, setup: RaceSetup) -> dict[str, Any]:
     others.begin(np.arange(n_cars), rules.reset(start_ndist=begun % 1), evaluated=True)
     crashed = np.zeros((n_steps, n_cars), bool)
     for at in range(n_steps):
-        rules.measure(CarState(*poses[:3, at], *np.zeros((3, n_cars))))
+        rules.measure(CarState(*poses[:3, at], *np.zeros((4, n_cars))))
         result, _ = others.judge(rules.apply(), poses[3, max(at - 1, 0)] - begun_s)
         crashed[at] = result.status == STATUS_CODE["crashed"]
     was = (rows["episode_status"] == "crashed").to_numpy()

@@ -58,7 +58,7 @@ def judged(rows: pd.DataFrame, setup) -> pd.DataFrame:
     rules.reset(start_ndist=begun % 1)
     out = np.empty((steps, cars, len(JUDGED)))
     for at in range(steps):
-        rules.measure(CarState(*poses[:, at], *np.zeros((3, cars))))
+        rules.measure(CarState(*poses[:, at], *np.zeros((4, cars))))
         result = rules.apply()
         paid = reward(
             rules.params(result, np.zeros(cars), np.zeros(cars)), rules.track_params, result.running
@@ -185,6 +185,6 @@ def test_poses_from_the_middle_of_a_lap_are_judged_as_in_the_whole_lap(training,
     after = rows.iloc[middle + 1]
     yaw_rad = np.radians(after["yaw"].to_numpy())
     x_m, y_m = after["X"] - FRONT_M * np.cos(yaw_rad), after["Y"] - FRONT_M * np.sin(yaw_rad)
-    rules.measure(CarState(x_m.to_numpy(), y_m.to_numpy(), yaw_rad, *np.zeros((3, len(middle)))))
+    rules.measure(CarState(x_m.to_numpy(), y_m.to_numpy(), yaw_rad, *np.zeros((4, len(middle)))))
     np.testing.assert_allclose(rules.apply().progress, after["progress"], rtol=0, atol=1e-9)
     np.testing.assert_array_equal(rules.steps, after["steps"])

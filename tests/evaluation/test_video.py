@@ -31,7 +31,7 @@ def test_a_film_shows_the_car_on_its_way_and_what_is_on_the_road(copied, start, 
     ended = start(
         *("evaluate", str(folder), *given, "evaluation.trials=1", "evaluation.time_s=2"),
         *("evaluation.held_out=null", "--video", "lap.mp4"),
-    ).end(300)
+    ).end()
     assert ended.code == 0, ended.stderr
     frames = read_frames(str(tmp_path / "lap.mp4"))
     about = next(frames)

@@ -103,7 +103,7 @@ def test_a_sweep_continues_when_a_node_is_gone(two_nodes, start, tmp_path):
 
     lost = running.wait_for(held_by_the_second, "trial on the second node")
     two_nodes.kill_the_second()
-    ended = running.end(240)
+    ended = running.end()
     assert ended.code == 0, ended.stderr
     assert_every_trial_is_accounted_for_once(tmp_path)
     assert next(claim for claim in claims(tmp_path) if claim.trial.number == lost.trial.number).attempt > 1
@@ -116,10 +116,10 @@ def test_ctrl_c_ends_the_workers_of_all_nodes_and_the_sweep_can_resume(two_nodes
     running = start(*SWEEP, "sweep.workers=2", "sweep/executor=ray")
     running.wait_for(lambda: known(tmp_path) and any(claim.progress for claim in claims(tmp_path)), "trial")
     running.popen.send_signal(signal.SIGINT)
-    assert running.end(240).code == 130
+    assert running.end().code == 130
     assert not two_nodes.actors()
     assert all(claim.expired or claim.has_ended for claim in claims(tmp_path))
-    assert start("sweep", "study=s", "sweep.workers=2").end(240).code == 0
+    assert start("sweep", "study=s", "sweep.workers=2").end().code == 0
     assert_every_trial_is_accounted_for_once(tmp_path)
 
 
