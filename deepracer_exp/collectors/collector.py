@@ -22,12 +22,11 @@ from deepracer_exp.env.others.head_to_head import Rivals, Weights, weights_of
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import BadInput, RunFailed, count
 from deepracer_exp.patience import wait_patiently
-from deepracer_exp.runs.crash_dump import read_crash_dump
+from deepracer_exp.runs.folder import read_crash_dump
 from deepracer_exp.runs.run_files import HEARTBEAT, LOG
 from deepracer_exp.sim.batch import cores
 
-from .car_worker import CarCollector, EnvFactory
-from .sampling import SamplingPolicy
+from .car_worker import CarCollector, EnvFactory, SamplingPolicy
 from .watchdog import Watchdog
 
 _DEATH_S = 30.0

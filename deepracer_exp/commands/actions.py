@@ -113,7 +113,7 @@ def _actions(args: argparse.Namespace) -> int:
     check_action_space_name(name)
     proposal = propose_actions(source.commands.within(source.car), args.count, source.car)
 
-    from deepracer_exp.reports.charts.proposal_charts import proposed_actions_picture
+    from deepracer_exp.reports.charts.action_charts import proposed_actions_picture
 
     metadata = replace(
         source.metadata, actions=proposal.actions, low=None, high=None, training_algorithm="clipped_ppo"

@@ -100,8 +100,7 @@ def _analyze(args: argparse.Namespace) -> int:
 
     from deepracer_exp.reports.findings import findings
     from deepracer_exp.reports.pages.log_report import LogPage, write_log_page
-    from deepracer_exp.reports.tables.beside import other_tracks
-    from deepracer_exp.reports.tables.log_tables import headline, result_in_words, trainings
+    from deepracer_exp.reports.tables.log_tables import headline, other_tracks, result_in_words, trainings
     from deepracer_exp.reports.tables.log_view import prepare
     from deepracer_exp.reports.tables.reward_replay import replay_reward
     from deepracer_exp.reports.tables.reward_terms import run_terms

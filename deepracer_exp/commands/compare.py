@@ -127,8 +127,7 @@ def _compare_recordings(args: argparse.Namespace, items: Sequence[Item]) -> int:
         recordings_compared,
     )
     from deepracer_exp.reports.pages.lap_replay import laps_of_log
-    from deepracer_exp.reports.tables.beside import evaluated_in_training
-    from deepracer_exp.reports.tables.log_tables import NONE, Table, headline
+    from deepracer_exp.reports.tables.log_tables import NONE, Table, evaluated_in_training, headline
     from deepracer_exp.reports.tables.log_view import prepare
     from deepracer_exp.runs.recording import read_log
 

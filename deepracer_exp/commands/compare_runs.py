@@ -41,8 +41,7 @@ _DIFFERENCES = (
 
 def compare_runs(args: argparse.Namespace, items: Sequence[Item]) -> int:
     """Compare runs, and groups of them."""
-    from deepracer_exp.reports.tables.group_curves import curves_table
-    from deepracer_exp.reports.tables.group_tables import groups_as_json
+    from deepracer_exp.reports.tables.group_tables import curves_table, groups_as_json
     from deepracer_exp.reports.tables.groups import compared
 
     groups = _groups(items)

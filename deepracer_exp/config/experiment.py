@@ -7,7 +7,15 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from .car import CarConfig
-from .driving import ActionSpaceConfig, EpisodeConfig, ObservationConfig, RandomizationConfig, RewardConfig
+from .driving import (
+    ActionSpaceConfig,
+    EpisodeConfig,
+    ObservationConfig,
+    RandomizationConfig,
+    RewardConfig,
+    TrackConfig,
+    Tracks,
+)
 from .evaluation import EvaluationConfig
 from .learning import (
     AdaptiveKLLR,
@@ -22,7 +30,6 @@ from .learning import (
 from .racing import ALONE, RaceConfig
 from .running import BudgetConfig, CheckpointsConfig, CollectorConfig, TrackingConfig
 from .stopping import ReliableStopping, StoppingConfig
-from .track import TrackConfig, Tracks
 
 
 def safe_name(name: str) -> str:

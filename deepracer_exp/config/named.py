@@ -8,13 +8,12 @@ from deepracer_exp.errors import BadInput
 
 from .car import CarConfig
 from .compose import compose_experiment, compose_option
-from .driving import RandomizationConfig
+from .driving import RandomizationConfig, TrackConfig
 from .evaluation import EvaluationConfig
 from .experiment import Experiment
 from .learning import CNNConfig
 from .overrides import override_line
 from .racing import RaceConfig
-from .track import TrackConfig
 
 
 def tracks_of(experiment: Experiment, config: EvaluationConfig) -> dict[str, TrackConfig]:

@@ -12,10 +12,10 @@ from pydantic import TypeAdapter, ValidationError
 from deepracer_exp.aws.worlds.catalogue import worlds
 from deepracer_exp.errors import BadInput, Unknown, nearest
 
+from .driving import TrackConfig
 from .experiment import Experiment
 from .learning import PPOConfig
 from .own_class import GROUPS, load_class, own_classes
-from .track import TrackConfig
 
 Config = TypeVar("Config")
 

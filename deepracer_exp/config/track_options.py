@@ -14,9 +14,9 @@ from hydra.core.override_parser.types import Override
 from deepracer_exp.aws.worlds.catalogue import find_world, leaders, worlds
 from deepracer_exp.errors import BadInput, Unknown, nearest
 
+from .driving import TrackConfig
 from .options import conf_dir, listed, options
 from .overrides import override_line, parse_single
-from .track import TrackConfig
 
 GROUP = "track"
 ALL = "all"

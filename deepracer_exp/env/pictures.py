@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.config.driving import CameraConfig
-from deepracer_exp.config.track import FloorConfig
+from deepracer_exp.config.driving import CameraConfig, FloorConfig
 from deepracer_exp.env.randomization.car_randomization import Ids
 from deepracer_exp.env.randomization.picture_randomization import PictureRandomization
 from deepracer_exp.sim.batch import CarState, cores

@@ -10,11 +10,10 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from deepracer_exp.agents.compiled_policy import CompiledPolicy
-from deepracer_exp.config.driving import ObservationConfig
+from deepracer_exp.config.driving import ObservationConfig, TrackConfig
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.named import conditions_of, race_of, tracks_of
-from deepracer_exp.config.track import TrackConfig
 from deepracer_exp.env.others.head_to_head import HeadToHead, rival_setup
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.real_car import as_the_car, require_car

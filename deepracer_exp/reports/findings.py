@@ -8,12 +8,11 @@ import numpy as np
 
 from deepracer_exp.errors import count
 from deepracer_exp.evaluation.zigzag import CONSOLE_CURE, CURE, ZIGZAG_DEG, ZIGZAG_PER_M, zigzag_in_words
-from deepracer_exp.reports.tables.beside import raced_beside
+from deepracer_exp.reports.tables.log_tables import raced_beside
 from deepracer_exp.reports.tables.log_view import LEAST_LAPS, LogView, thirds
-from deepracer_exp.reports.tables.log_zigzag import zigzag_now
 from deepracer_exp.reports.tables.off_track import JUDGEMENTS, OffTrackPlace, off_track_places
 from deepracer_exp.reports.tables.others_on_road import costliest
-from deepracer_exp.reports.tables.sector_times import sectors_now
+from deepracer_exp.reports.tables.sector_times import sectors_now, zigzag_now
 from deepracer_exp.reports.tables.statistics import wilson
 from deepracer_exp.reports.tables.step_columns import begins_of, first_rows
 from deepracer_exp.reports.tables.tables import CANDIDATE_LAPS, DENSE

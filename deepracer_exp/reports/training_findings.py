@@ -4,14 +4,16 @@ Advice on a log of the service uses the console's terms, advice on a run of ours
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from deepracer_exp.errors import count
 from deepracer_exp.reports.tables.log_view import LEAST_EPISODES, LogView, once_per_view
 from deepracer_exp.reports.tables.slower_laps import CHANCE, LEAST_TIMES, SLOWER, SlowerLaps, slower_laps
-from deepracer_exp.reports.tables.statistics import Values, moving_average
+from deepracer_exp.reports.tables.statistics import Values, chance_of_rise, moving_average
 from deepracer_exp.runs.checkpoint_files import kept_checkpoints
 from deepracer_exp.runs.run_files import CHECKPOINTS
 from deepracer_exp.training.stopping.judge import (
@@ -25,8 +27,6 @@ from deepracer_exp.training.stopping.judge import (
 from deepracer_exp.training.stopping.stopping_rules import entropy_share
 
 from .finding import LEAST_LOSS_S, Finding, Numbers
-from .rising_entropy import CHANCE as ENTROPY_CHANCE
-from .rising_entropy import RISE, rising_entropy
 
 _RANDOM = 0.95
 """Share of the highest entropy above which a policy decides almost at random."""
@@ -337,3 +337,50 @@ def _instead(view: LogView) -> str:
     return (
         f"the checkpoint {first['checkpoint']}" if first["checkpoint"] else "the best checkpoint named below"
     )
+
+
+LEAST_ITERATIONS = 12
+"""Fewest iterations for a test."""
+_BLOCKS = 12
+"""More iterations are averaged to so many, because neighbours are not independent."""
+RISE = 0.2
+"""Rise that counts: of a list of actions as a share of the highest entropy, of a continuous space as the share by which
+the actions scatter more."""
+ENTROPY_CHANCE = 0.02
+"""Significance level: the chance of a false alarm for an entropy that only scatters."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RisingEntropy:
+    """A rise of the entropy; entropies are means of three iterations in nats."""
+
+    since: int
+    """The iteration at which it was lowest."""
+    lowest: float
+    now: float
+    rise: float
+    """The rise in the terms of `RISE`."""
+
+
+def rising_entropy(iterations: pd.DataFrame, action_count: int | None) -> RisingEntropy | None:
+    """Test whether entropy has risen since it was lowest; None: it has not, or there are too few iterations to say.
+
+    The entropies since then are compared with their order (Kendall's tau, one-sided), the chance of a false alarm
+    divided by the number of possible starts (Bonferroni), as for `slower_laps`.
+
+    Args:
+        iterations: a row each, with `iteration` and `entropy` in nats.
+        action_count: of a discrete policy, None of a continuous one.
+    """
+    rows = iterations[iterations["entropy"].notna()]
+    if len(rows) < LEAST_ITERATIONS:
+        return None
+    entropy = moving_average(rows["entropy"].to_numpy(np.float64))
+    place = int(entropy.argmin())
+    lowest, now = float(entropy[place]), float(entropy[-1])
+    rise = entropy_share(now, lowest, action_count) - entropy_share(lowest, lowest, action_count)
+    parts = np.array_split(rows["entropy"].to_numpy(np.float64), _BLOCKS)
+    blocks = np.array([part.mean() for part in parts])
+    if rise < RISE or not chance_of_rise(blocks[blocks.argmin() :]) < ENTROPY_CHANCE / _BLOCKS:
+        return None
+    return RisingEntropy(since=int(rows["iteration"].iloc[place]), lowest=lowest, now=now, rise=rise)

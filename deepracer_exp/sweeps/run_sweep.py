@@ -28,6 +28,7 @@ from deepracer_exp.env.setup import build_setup
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.reward import RewardFunction
 from deepracer_exp.runs.lineage import refuse_other_networks
+from deepracer_exp.sweeps.queue.study import enqueue, known_settings
 from deepracer_exp.sweeps.report.best_trial import (
     best_line,
     best_shown,
@@ -47,7 +48,6 @@ from .fresh_laps import rerank
 from .plan import SweepPlan
 from .queue.claims import Claim, TrialClaims, report_results
 from .queue.driver import Driver
-from .queue.enqueued import enqueue, known_settings
 from .queue.launcher import LocalLauncher
 from .queue.ray_launcher import RayLauncher
 from .queue.storage import open_storage, patiently, resolve_database

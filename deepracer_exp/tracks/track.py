@@ -14,7 +14,7 @@ from shapely.geometry.base import BaseGeometry
 
 from deepracer_exp.aws.worlds.catalogue import find_world, worlds
 from deepracer_exp.aws.worlds.routes import checked_rows, read_knots, read_route, rows_from_knots, world_rows
-from deepracer_exp.config.track import FloorConfig, TrackConfig
+from deepracer_exp.config.driving import FloorConfig, TrackConfig
 from deepracer_exp.errors import BadInput
 
 from . import segments

@@ -28,9 +28,8 @@ from deepracer_exp.errors import RunFailed, reading
 from deepracer_exp.evaluation.results import Evaluation
 from deepracer_exp.evaluation.rival_run import kept_rival
 from deepracer_exp.runs.checkpoints import CheckpointStore, read_agent
-from deepracer_exp.runs.crash_dump import write_crash_dump
 from deepracer_exp.runs.fingerprint import fingerprint
-from deepracer_exp.runs.folder import RunFolder
+from deepracer_exp.runs.folder import RunFolder, write_crash_dump
 from deepracer_exp.runs.run_files import SUMMARY, TRACE
 from deepracer_exp.runs.run_result import FAILED, FINISHED, INTERRUPTED, Ending, fastest_reliable
 from deepracer_exp.runs.trace import trace_writer

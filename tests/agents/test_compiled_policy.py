@@ -10,7 +10,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from deepracer_exp.agents.actor_critic import build_actor_critic
 from deepracer_exp.agents.compiled_policy import CompiledPolicy
-from deepracer_exp.collectors.sampling import NOISE, SamplingPolicy
+from deepracer_exp.collectors.car_worker import NOISE, SamplingPolicy
 from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.config.learning import MLPConfig
 

@@ -4,7 +4,7 @@ from tensordict import TensorDict
 from torch.distributions import Categorical
 from torchrl.modules import IndependentNormal
 
-from deepracer_exp.collectors.sampling import NOISE, SamplingPolicy, _drawn
+from deepracer_exp.collectors.car_worker import NOISE, SamplingPolicy, _drawn
 
 
 @pytest.fixture

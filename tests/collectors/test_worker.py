@@ -3,8 +3,7 @@ import torch
 from torchrl.collectors import Collector
 
 from deepracer_exp.agents.actor_critic import build_actor_critic
-from deepracer_exp.collectors.car_worker import CarCollector, EnvFactory
-from deepracer_exp.collectors.sampling import SamplingPolicy
+from deepracer_exp.collectors.car_worker import CarCollector, EnvFactory, SamplingPolicy
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.env.setup import build_setup

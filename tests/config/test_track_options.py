@@ -5,8 +5,8 @@ import pytest
 
 from deepracer_exp.aws.worlds.catalogue import find_world, leaders, worlds
 from deepracer_exp.config.compose import compose_experiment, expand_grid
+from deepracer_exp.config.driving import TrackConfig
 from deepracer_exp.config.overrides import parse_single
-from deepracer_exp.config.track import TrackConfig
 from deepracer_exp.config.track_options import by_world_name
 from tests.conftest import refused
 

@@ -13,7 +13,7 @@ from deepracer_exp.api import compose, make_env
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.gym_env import DeepRacerEnv
 from deepracer_exp.env.observation import observation_shape
-from deepracer_exp.env.others.collisions import CAR_M
+from deepracer_exp.env.others.boxes_and_bots import CAR_M
 from deepracer_exp.env.others.head_to_head import HeadToHead, Rivals, rival_setup, weights_of
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.env.trace_columns import EPISODE_STATUS, PACKED

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.env.others.collisions import BOX_M
+from deepracer_exp.env.others.boxes_and_bots import BOX_M
 from deepracer_exp.env.others.race_others import NEAR_M, with_crashes
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.setup import build_setup

@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 import shapely
 
-from deepracer_exp.config.driving import PictureRandomizationConfig
-from deepracer_exp.config.track import FloorConfig
+from deepracer_exp.config.driving import FloorConfig, PictureRandomizationConfig
 from deepracer_exp.env.pictures import GREY, floor_colors
 from deepracer_exp.env.randomization.picture_randomization import (
     QUANTITIES,

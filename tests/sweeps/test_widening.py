@@ -8,9 +8,8 @@ from optuna.trial import TrialState
 from deepracer_exp.config.compose import compose_evaluation
 from deepracer_exp.config.sweep import compose_sweep
 from deepracer_exp.sweeps.queue.claims import TrialClaims
-from deepracer_exp.sweeps.queue.enqueued import enqueue, known_settings
 from deepracer_exp.sweeps.queue.storage import open_storage
-from deepracer_exp.sweeps.queue.study import complete_widening, open_study
+from deepracer_exp.sweeps.queue.study import complete_widening, enqueue, known_settings, open_study
 from deepracer_exp.sweeps.queue.trial_run import TrialRun
 from deepracer_exp.sweeps.queue.worker import Worker
 from deepracer_exp.sweeps.queue.worker_config import WorkerConfig

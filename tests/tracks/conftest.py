@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.config.track import TrackConfig
+from deepracer_exp.config.driving import TrackConfig
 from deepracer_exp.tracks.track import Track
 
 

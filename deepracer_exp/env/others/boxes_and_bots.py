@@ -6,19 +6,18 @@ is touched (deepracer-simapp, markov/agent_ctrl/obstacles_agent_ctrl.py and bot_
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deepracer_exp.config.racing import BoxesConfig, RaceConfig
 from deepracer_exp.errors import BadInput
+from deepracer_exp.jit import njit
 from deepracer_exp.tracks.lanes import Lanes, Paths
 from deepracer_exp.tracks.track import Track, TrackIndex, Tracks
 
-from .bots import Bots, Manner, drive
-from .collisions import BOX_M, CAR_M, first_hit
-from .service_draws import END_M
+from .service_draws import END_M, uniform
 
 _ROUNDING_S = 1e-9
 
@@ -204,3 +203,125 @@ def check_room(race: RaceConfig, tracks: Sequence[tuple[str, Track]]) -> None:
                     f"race.{key}.min_distance_m={least_m:g} apart",
                     f"up to {most}",
                 )
+
+
+CAR_M = (0.32352, 0.1961)
+"""Crash rectangle of a car or bot, along and across, centred on its origin (deepracer-simapp,
+track_geom/constants.py)."""
+BOX_M = (0.50, 0.40)
+"""Crash rectangle of a box of any type; the first number of the service's pair is the extent across."""
+
+
+@njit(cache=True, nogil=True)
+def first_hit(x_m, y_m, yaw_rad, poses, half_m):  # type: ignore[no-untyped-def]
+    """Return the index of the first of K others whose rectangle contains a corner of each of N cars, or -1, (N,).
+
+    Args:
+        x_m: of the cars' origins, (N,), metres.
+        y_m: of the cars' origins, (N,), metres.
+        yaw_rad: headings of the cars, (N,).
+        poses: x, y and yaw of the others, (N, K, 3).
+        half_m: half the others' extents along and across, (K, 2).
+    """
+    cars, count = poses.shape[:2]
+    hit = np.full(cars, -1)
+    half_length, half_width = 0.5 * CAR_M[0], 0.5 * CAR_M[1]
+    reach = math.hypot(half_length, half_width)
+    for car in range(cars):
+        cos, sin = math.cos(yaw_rad[car]), math.sin(yaw_rad[car])
+        for other in range(count):
+            dx, dy = x_m[car] - poses[car, other, 0], y_m[car] - poses[car, other, 1]
+            near = reach + math.hypot(half_m[other, 0], half_m[other, 1])
+            if dx * dx + dy * dy >= near * near:
+                continue
+            turn_cos, turn_sin = math.cos(poses[car, other, 2]), math.sin(poses[car, other, 2])
+            for corner in range(4):
+                along = half_length if corner < 2 else -half_length
+                across = half_width if corner % 2 else -half_width
+                px, py = dx + cos * along - sin * across, dy + sin * along + cos * across
+                ahead, left = turn_cos * px + turn_sin * py, turn_cos * py - turn_sin * px
+                if abs(ahead) < half_m[other, 0] and abs(left) < half_m[other, 1]:
+                    hit[car] = other
+                    break
+            if hit[car] >= 0:
+                break
+    return hit
+
+
+_MOST_BOTS = 1000
+"""Numbers of an episode's seed for each change of lanes, one for each bot."""
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _between(rows, lane, cell, part, column):  # type: ignore[no-untyped-def]
+    before = rows[lane, cell, column]
+    return before + part * (rows[lane, cell + 1, column] - before)
+
+
+class Manner(NamedTuple):
+    """Settings of the bots' driving; see `conf/race`."""
+
+    speed_mps: float
+    pause_s: float
+    least_after_s: float
+    """Least and most time between two changes of lanes; infinite: none is changed."""
+    most_after_s: float
+    change_m: float
+
+
+class Bots(NamedTuple):
+    """The bots of N cars: arrays with a row per car, changed in place; see `env.others.boxes_and_bots.Others`."""
+
+    start_m: np.ndarray
+    lane: np.ndarray
+    changes: np.ndarray
+    change_begin_s: np.ndarray
+    change_end_s: np.ndarray
+    seed: np.ndarray
+    pauses: np.ndarray
+    poses: np.ndarray
+    distance_m: np.ndarray
+    offset_m: np.ndarray
+
+
+@njit(cache=True, nogil=True)
+def drive(ids, track_index, time_s, paths, manner, bots):  # type: ignore[no-untyped-def]
+    """Move the bots of the cars `ids` on their tracks to a time, (n,) each, and change their lanes."""
+    speed_mps, pause_s, least_after_s, most_after_s, change_m = manner
+    start_m, lane, changes, change_begin_s, change_end_s, seed, pauses, poses, distance_m, offset_m = bots
+    changing, rows = math.isfinite(least_after_s), paths.rows
+    for place in range(len(ids)):
+        car, track, now_s = ids[place], track_index[place], time_s[place]
+        length_m, first, cells = paths.length_m[track], paths.first_row[track], paths.cells[track]
+        driven_m = speed_mps * max(now_s - pauses[car] * pause_s, 0.0)
+        for bot in range(start_m.shape[1]):
+            if changing and now_s >= change_end_s[car, bot]:
+                if changes[car, bot] > 0:
+                    lane[car, bot] = 1 - lane[car, bot]
+                share = uniform(seed[car], _MOST_BOTS * changes[car, bot] + bot)
+                changes[car, bot] += 1
+                begin_s = now_s + least_after_s + share * (most_after_s - least_after_s)
+                change_begin_s[car, bot] = begin_s
+                change_end_s[car, bot] = begin_s + change_m / speed_mps
+            at_m = (start_m[car, bot] + driven_m) % length_m
+            cell = at_m / length_m * cells
+            index = min(int(cell), cells - 1)
+            part = cell - index
+            here, cell_at = lane[car, bot], first + index
+            x, y = _between(rows, here, cell_at, part, 0), _between(rows, here, cell_at, part, 1)
+            dx, dy = _between(rows, here, cell_at, part, 2), _between(rows, here, cell_at, part, 3)
+            ahead, offset = _between(rows, here, cell_at, part, 4), _between(rows, here, cell_at, part, 5)
+            if changing and now_s > change_begin_s[car, bot] and changes[car, bot] > 0:
+                # From lane to lane as a cubic with the lanes' here directions at both ends.
+                share = min((now_s - change_begin_s[car, bot]) * speed_mps / change_m, 1.0)
+                weight, slope = share * share * (3.0 - 2.0 * share), 6.0 * share * (1.0 - share) / change_m
+                to_x = _between(rows, 1 - here, cell_at, part, 0) - x
+                to_y = _between(rows, 1 - here, cell_at, part, 1) - y
+                dx += weight * (_between(rows, 1 - here, cell_at, part, 2) - dx) + slope * to_x
+                dy += weight * (_between(rows, 1 - here, cell_at, part, 3) - dy) + slope * to_y
+                x, y = x + weight * to_x, y + weight * to_y
+                ahead += weight * (_between(rows, 1 - here, cell_at, part, 4) - ahead)
+                offset += weight * (_between(rows, 1 - here, cell_at, part, 5) - offset)
+            poses[car, bot, 0], poses[car, bot, 1], poses[car, bot, 2] = x, y, math.atan2(dy, dx)
+            distance_m[car, bot] = (at_m + ahead) % length_m
+            offset_m[car, bot] = offset

@@ -17,8 +17,7 @@ from deepracer_exp.sim.scenery import box_corners
 from deepracer_exp.tracks.lanes import Lanes
 from deepracer_exp.tracks.track import Track, Tracks
 
-from .boxes_and_bots import Others
-from .collisions import BOX_M
+from .boxes_and_bots import BOX_M, Others
 from .service_draws import episode_seeds, place
 
 Floats = NDArray[np.float64]

@@ -9,9 +9,8 @@ from deepracer_exp.errors import count
 from deepracer_exp.evaluation.zigzag import CENTRED_DEG, zigzag_in_words
 from deepracer_exp.reports.tables.against_fastest import CAUSES, loss, lost_in_words
 from deepracer_exp.reports.tables.log_view import STARTING_STEPS, LogView, closest_waypoints
-from deepracer_exp.reports.tables.log_zigzag import zigzag_now
 from deepracer_exp.reports.tables.racing_line import center_line, minimum_curvature_line
-from deepracer_exp.reports.tables.sector_times import sectors_now
+from deepracer_exp.reports.tables.sector_times import sectors_now, zigzag_now
 from deepracer_exp.reports.tables.statistics import MOST_ROWS, Values, means, quantiles, subsample
 from deepracer_exp.reports.tables.step_columns import SPEED_STEPS, first_rows
 from deepracer_exp.tracks.sectors import sectors_of, waypoint_positions

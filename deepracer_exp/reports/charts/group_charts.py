@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from deepracer_exp.reports.tables.group_curves import CURVES, group_curve
+from deepracer_exp.reports.tables.group_tables import CURVES, group_curve
 from deepracer_exp.reports.tables.groups import FORMS, RunGroup, courses_of
 
 from .figure import Chart, Layer, Panel, band, in_rows, line, points

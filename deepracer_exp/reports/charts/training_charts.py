@@ -1,6 +1,6 @@
-"""Charts of a training: its progress, its quarters, its updates beside lap times, its stability, its evaluations."""
+"""Charts of a training: its progress, its quarters, its updates beside lap times, its evaluations, live or over."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,8 +9,10 @@ import pandas as pd
 from deepracer_exp.reports.tables.log_view import LogView
 from deepracer_exp.reports.tables.statistics import MOST_ROWS, histogram, moving_average, quantiles, subsample
 
-from .figure import Chart, Layer, Panel, band, bars, in_rows, line, mark, points
-from .style import BLUE, FAINT, GREEN, ORANGE, PURPLE, SKY, VERMILION
+from .figure import Chart, Layer, Panel, band, bars, colored_points, in_rows, line, mark, points
+from .maps import map_panel, outlines
+from .run_pictures import TrackLines
+from .style import BLUE, FAINT, GREEN, ORANGE, PALE, PURPLE, SKY, VERMILION
 
 ITERATION = "iteration (policy update)"
 _HEALTHY_MS, _TOO_LONG_MS = 1000 / 15, 90.0
@@ -280,3 +282,72 @@ def _joined(table: pd.DataFrame, column: str, color: str, name: str) -> list[Lay
 
 def _over_iterations(title: str, unit: str, layers: Sequence[Layer]) -> Panel:
     return Panel(title=title, x_label=ITERATION, y_label=unit, layers=layers)
+
+
+_CURVES: Mapping[str, tuple[str, Mapping[str, tuple[str | None, str]]]] = {
+    "Driven, per cent": (
+        "per cent",
+        {
+            "completion": ("exploring episodes, mean", BLUE),
+            "eval_completion": ("evaluated usual laps, mean", ORANGE),
+        },
+    ),
+    "Lap time": (
+        "s",
+        {
+            "mean_lap_time_s": ("exploring laps, mean", BLUE),
+            "best_lap_time_s": ("fastest exploring lap", GREEN),
+            "eval_lap_time_s": ("evaluated usual laps, mean", ORANGE),
+        },
+    ),
+    "Return of an episode, mean": ("return", {"mean_return": (None, BLUE)}),
+    "Entropy of the policy": ("nats", {"entropy": (None, PURPLE)}),
+}
+"""Panels with their units, and their curves by column of metrics.jsonl, each with its name and colour."""
+
+
+def curves_so_far(rows: Sequence[Mapping[str, Any]]) -> Chart:
+    """Draw the learning curves of a run from the rows of its metrics.jsonl, at least one; of tracks their mean."""
+    table = pd.DataFrame(rows)
+    steps = table["env_steps"].to_numpy(np.float64) / 1000
+    panels = []
+    for title, (unit, curves) in _CURVES.items():
+        layers: list[Layer] = []
+        for column, (name, color) in curves.items():
+            columns = [key for key in table if key == column or key.startswith(f"{column}/")]
+            # Not every iteration ends an episode on every track, or is evaluated.
+            values = table[columns].astype(float).mean(axis=1).to_numpy()
+            finite = np.isfinite(values)
+            if finite.any():
+                layers.append(line(steps[finite], values[finite], color, name))
+        panels.append(Panel(title=title, y_label=unit, x_label="thousand control steps", layers=layers))
+    return Chart(
+        name="curves_so_far",
+        title="How it learns",
+        caption="Exploring, the policy draws its actions; evaluated, it takes the most probable ones.",
+        rows=in_rows(panels),
+        share_x=True,
+    )
+
+
+def newest_laps(shown: Sequence[TrackLines]) -> Chart:
+    """Draw laps on their tracks, coloured by measured speed, on one scale."""
+    speeds = np.concatenate([points[:, 2] for here in shown for points in here.lines] or [np.zeros(1)])
+    # The few steps after a standing start would take half of the colours.
+    colors = float(np.percentile(speeds, 5)), max(float(speeds.max()), float(np.percentile(speeds, 5)) + 0.1)
+    panels = []
+    for here in shown:
+        layers: list[Layer] = [line(points[:, 0], points[:, 1], PALE, width=1.0) for points in here.lines]
+        if here.lines:
+            x, y, speed_mps = np.concatenate(here.lines).T
+            layers.append(colored_points(x, y, speed_mps, "speed, m/s", size=5.0, value_range=colors))
+        if len(here.boxes):
+            layers.append(outlines(here.boxes, VERMILION))
+        panels.append(map_panel(here.track, layers, title=f"{here.track.title}: {here.words}"))
+    return Chart(
+        name="newest_laps",
+        title="The laps of the newest checkpoint",
+        caption="One dot for each control step on the usual conditions, coloured by the speed of the car."
+        + " The outlines are boxes; each lap has its own." * any(len(here.boxes) for here in shown),
+        rows=in_rows(panels),
+    )

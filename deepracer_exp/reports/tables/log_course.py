@@ -14,9 +14,9 @@ from deepracer_exp.aws.logs.sim_trace import EARLIEST_CLOCK_S
 from deepracer_exp.aws.worlds.catalogue import find_world, worlds
 from deepracer_exp.aws.worlds.routes import NEAR_M, recognise, world_rows
 from deepracer_exp.config.car import CarConfig
+from deepracer_exp.config.driving import TrackConfig
 from deepracer_exp.config.named import service_car
 from deepracer_exp.config.parse import parse_experiment
-from deepracer_exp.config.track import TrackConfig
 from deepracer_exp.env.rules import wheels_on_road
 from deepracer_exp.errors import BadInput, nearest
 from deepracer_exp.runs.run_files import CONFIG, read_config

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from deepracer_exp.aws.logs.recorded import Recording
 from deepracer_exp.config.custom_files.job_race import recorded_race
-from deepracer_exp.env.others.collisions import BOX_M, CAR_M, first_hit
+from deepracer_exp.env.others.boxes_and_bots import BOX_M, CAR_M, first_hit
 from deepracer_exp.env.others.placement import (
     PlacedOthers,
     Placement,

@@ -10,8 +10,7 @@ import pytest
 from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.reports.findings import findings
 from deepracer_exp.reports.pages.log_report import LogPage, html
-from deepracer_exp.reports.tables.beside import other_tracks, raced_beside
-from deepracer_exp.reports.tables.log_tables import facts, headline
+from deepracer_exp.reports.tables.log_tables import facts, headline, other_tracks, raced_beside
 from deepracer_exp.reports.tables.log_view import LogView, prepare
 
 

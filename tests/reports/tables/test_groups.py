@@ -9,8 +9,14 @@ import pytest
 
 from deepracer_exp.reports.charts.group_charts import best_checkpoints, learning_curve_charts
 from deepracer_exp.reports.tables.evidence import SAME, TOO_FEW, estimate
-from deepracer_exp.reports.tables.group_curves import curves_table, group_curve
-from deepracer_exp.reports.tables.group_tables import differences_table, groups_as_json, scored, sentences
+from deepracer_exp.reports.tables.group_tables import (
+    curves_table,
+    differences_table,
+    group_curve,
+    groups_as_json,
+    scored,
+    sentences,
+)
 from deepracer_exp.reports.tables.groups import RunGroup, compared, group_runs
 from deepracer_exp.runs.run_files import RunRecord, read_record
 

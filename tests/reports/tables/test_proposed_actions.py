@@ -8,7 +8,7 @@ from scipy.spatial.distance import cdist
 
 from deepracer_exp.config.bounds import FEWEST_ACTIONS
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.reports.charts.proposal_charts import proposed_actions_picture
+from deepracer_exp.reports.charts.action_charts import proposed_actions_picture
 from deepracer_exp.reports.tables.proposed_actions import (
     DEGREES_PER_MPS,
     NEAR,

@@ -8,7 +8,7 @@ import pytest
 from deepracer_exp.evaluation.zigzag import CENTRED_DEG, ZigZag, total_zigzag, zigzag_of
 from deepracer_exp.reports.findings import findings
 from deepracer_exp.reports.tables.log_view import prepare
-from deepracer_exp.reports.tables.log_zigzag import zigzag_in
+from deepracer_exp.reports.tables.sector_times import zigzag_in
 from deepracer_exp.tracks.track import Track
 
 from .made_up import Drive, made_up_course, made_up_recording
