@@ -1,0 +1,1 @@
+"""Reward functions: found and checked (`source.load_reward_source`), and called (`reward.RewardFunction`)."""

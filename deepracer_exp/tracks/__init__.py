@@ -1,0 +1,1 @@
+"""Tracks: their geometry (`track.Track`), lanes, sectors, outline and official boards."""

@@ -1,0 +1,1 @@
+"""Randomization of cars, of their pictures, and of the physical car's ways."""

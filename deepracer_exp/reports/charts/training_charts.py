@@ -1,4 +1,4 @@
-"""Charts of a training: its progress, its quarters, its updates beside lap times, its evaluations, live or over."""
+"""Charts of a training, live or over: progress, quarters, updates beside lap times, stability, evaluations."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -1,0 +1,1 @@
+"""HTML pages: reports of logs and runs, comparisons, replays, live views."""
