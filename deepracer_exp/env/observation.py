@@ -16,6 +16,8 @@ from deepracer_exp.tracks.track import TrackIndex, Tracks
 
 from .state import Measures
 
+OF_CAR = ("offset", "heading_error_sin", "heading_error_cos", "speed", "yaw_rate", "last_steering", "last_speed")
+"""Features of the car on the road, in the order in which `_features` writes them."""
 OTHERS = ("gap", "side", "closing", "bot")
 """Features of each of the next boxes and bots, see `RaceOthers.features`."""
 SLIDING = ("side_speed", "wheel_angle")
@@ -96,13 +98,7 @@ def observation_shape(config: ObservationConfig) -> ObservationShape:
 
 def _names(config: ObservationConfig, parts: Sequence[ObservationPart]) -> tuple[str, ...]:
     return (
-        "offset",
-        "heading_error_sin",
-        "heading_error_cos",
-        "speed",
-        "yaw_rate",
-        "last_steering",
-        "last_speed",
+        *OF_CAR,
         *(f"ahead_{axis}_{distance:g}" for distance in config.lookahead_m for axis in "xy"),
         *(SLIDING if config.sliding else ()),
         *(f"next_{number}_{what}" for number in range(1, config.next_objects + 1) for what in OTHERS),
@@ -178,7 +174,7 @@ class Features:
         )
         center, closed = self._tracks.lines[0], self._tracks.closed
         _features(observed, self._scales, center, closed, self._ahead_ndist, out)
-        end = 7 + 2 * len(config.lookahead_m)
+        end = len(OF_CAR) + 2 * len(config.lookahead_m)
         if config.sliding:
             out[:, end] = car.lateral_mps / self._scales.speed_mps
             out[:, end + 1] = np.degrees(car.wheel_angle_rad) / self._scales.steering_deg
@@ -238,5 +234,5 @@ def _features(observed, scales, center, closed, ahead_ndist, out):  # type: igno
         for number in range(ahead_ndist.shape[1]):
             x, y, _ = pose_at(center, closed[line], line, observed.ndist[car] + ahead_ndist[line, number])
             dx, dy = x - front[car, 0], y - front[car, 1]
-            out[car, 7 + 2 * number] = dx * cos + dy * sin
-            out[car, 8 + 2 * number] = dy * cos - dx * sin
+            out[car, len(OF_CAR) + 2 * number] = dx * cos + dy * sin
+            out[car, len(OF_CAR) + 2 * number + 1] = dy * cos - dx * sin

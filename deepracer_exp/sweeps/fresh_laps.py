@@ -56,7 +56,7 @@ def rerank(
     for trial in complete_trials(study)[: config.rerank]:
         on_next(trial)
         runs = Trial.of(trial).runs
-        driven = [drive(run.folder(worker_config.folder), protocol, on_step)[0] for run in runs]
+        driven = [drive_fresh(run.folder(worker_config.folder), protocol, on_step)[0] for run in runs]
         fresh_laps.append(_reranked(trial.number, driven, config.objectives, protocol.time_s))
     return sorted(fresh_laps, key=lambda laps: cost(config.objectives, laps.values))
 
@@ -114,7 +114,7 @@ def _resampled(group: TrialGroup, objective: str, rng: np.random.Generator) -> N
     return sums[:, rng.integers(len(column), size=(_RESAMPLES, len(column)))].sum(axis=2)
 
 
-def drive(run_dir: Path, protocol: EvaluationConfig, on_step: "OnStep") -> tuple[Evaluation, str]:
+def drive_fresh(run_dir: Path, protocol: EvaluationConfig, on_step: "OnStep") -> tuple[Evaluation, str]:
     """Let the best checkpoint of a run drive; return the result and the checkpoint's name.
 
     Raises:

@@ -30,7 +30,7 @@ from deepracer_exp.training.plan import ResumePlan, TrainPlan, plan_resume
 from deepracer_exp.training.run import run_training
 from deepracer_exp.training.trainer import Callback, Trainer
 
-from .fresh_laps import drive, fresh, interval_of
+from .fresh_laps import drive_fresh, fresh, interval_of
 from .queue.claims import Claim
 from .queue.worker_config import WorkerConfig
 from .report.last_race import LastRace, Racer, clone_words, store_last_race
@@ -162,7 +162,7 @@ class LastStage:
         name, laps = "the clone" if is_clone else f"trial {trial}", self._config.config.rerank_laps
         protocol = fresh(self._config.protocol, laps, again=True)
         self._show(f"{name} drives {laps} fresh laps in the last race")
-        evaluation, checkpoint = drive(run, protocol, self._check)
+        evaluation, checkpoint = drive_fresh(run, protocol, self._check)
         usual = evaluation.on(USUAL)
         held_out = evaluation.on(HELD_OUT) if HELD_OUT in evaluation.conditions else None
         (score_s,) = objective_values(evaluation, ("race_score",), protocol.time_s)

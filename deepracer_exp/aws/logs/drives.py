@@ -69,7 +69,7 @@ def in_degrees(table: pa.Table) -> pa.Table:
 def iterations_of(table: pa.Table, log: TrainingLog, episodes_per_iteration: int) -> Ints:
     """Return the iteration of each row of a text log: as logged, or by counting episodes."""
     episode = table["episode"].to_numpy().astype(np.int64)
-    driven = [(first, checkpoint_number(name)) for first, name in log.checkpoints if first is not None]
+    driven = [(first, logged_number(name)) for first, name in log.checkpoints if first is not None]
     if driven:
         starts, number = np.array(sorted(driven), np.int64).T
         return number[np.maximum(np.searchsorted(starts, episode, side="right") - 1, 0)] - first_checkpoint(
@@ -88,7 +88,7 @@ def iterations_of(table: pa.Table, log: TrainingLog, episodes_per_iteration: int
     return np.where(place < len(logged_episodes), logged[np.minimum(place, len(logged_episodes) - 1)], beyond)
 
 
-def checkpoint_number(name: str) -> int:
+def logged_number(name: str) -> int:
     """Return the number of a checkpoint `309_Step-8349`."""
     return int(name.partition("_")[0])
 
@@ -97,7 +97,7 @@ def first_checkpoint(log: TrainingLog) -> int:
     """Return the number of the checkpoint a training began with: a clone's numbers continue its parent's."""
     names = [*log.saved, *(name for _, name in log.checkpoints)]
     fresh = (name for name in names if name.endswith("_Step-0"))
-    return checkpoint_number(next(fresh, names[0])) if names else 0
+    return logged_number(next(fresh, names[0])) if names else 0
 
 
 def _episodes_between(log: TrainingLog, usual: int) -> int:

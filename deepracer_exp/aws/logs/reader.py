@@ -14,9 +14,9 @@ from deepracer_exp.errors import BadInput
 from .drives import (
     Drives,
     Rows,
-    checkpoint_number,
     concatenated,
     first_checkpoint,
+    logged_number,
     number_episodes,
     steps_of,
 )
@@ -192,8 +192,8 @@ class _Assembly:
             base = self._base(number)
             for log in self._logs_of(number):
                 for name in (*log.saved, *(name for _, name in log.checkpoints)):
-                    if checkpoint_number(name) >= base:  # a clone's log names its parent, too
-                        names[checkpoint_number(name) - base + begin] = name
+                    if logged_number(name) >= base:  # a clone's log names its parent, too
+                        names[logged_number(name) - base + begin] = name
         return names
 
     def _evaluation_rows(self) -> list[Rows]:

@@ -38,7 +38,7 @@ _WEAVE_S = 0.27
 
 
 @dataclass(frozen=True, kw_only=True)
-class Driver:
+class SimpleDriver:
     """The style of a lap."""
 
     lateral_mps2: float
@@ -57,7 +57,7 @@ class Driver:
 class DrivenLap:
     """A complete lap with all wheels on the track."""
 
-    driver: Driver
+    driver: SimpleDriver
     speed_mps: float
     """Commanded on straights; less in bends."""
     time_s: float
@@ -74,7 +74,7 @@ def action_space_laps(setup: RaceSetup) -> list[DrivenLap]:
     shares = [*shares[:-1], 1.0]
     best: list[DrivenLap] = []
     laps = drive_laps(
-        setup, [Driver(lateral_mps2=bend, share=share) for bend in _LATERAL_MPS2 for share in shares]
+        setup, [SimpleDriver(lateral_mps2=bend, share=share) for bend in _LATERAL_MPS2 for share in shares]
     )
     for first in range(0, len(laps), len(shares)):
         complete = [lap for lap in laps[first : first + len(shares)] if lap is not None]
@@ -90,7 +90,7 @@ def flawed_laps(setup: RaceSetup, good: DrivenLap) -> dict[str, DrivenLap]:
     it, the lap is missing.
     """
 
-    def laps(bends: Sequence[float], **flaw: float) -> list[Driver]:
+    def laps(bends: Sequence[float], **flaw: float) -> list[SimpleDriver]:
         return [replace(good.driver, lateral_mps2=bend * good.driver.lateral_mps2, **flaw) for bend in bends]
 
     flaws = {
@@ -110,7 +110,7 @@ def flawed_laps(setup: RaceSetup, good: DrivenLap) -> dict[str, DrivenLap]:
     return flawed
 
 
-def drive_laps(setup: RaceSetup, drivers: Sequence[Driver]) -> list[DrivenLap | None]:
+def drive_laps(setup: RaceSetup, drivers: Sequence[SimpleDriver]) -> list[DrivenLap | None]:
     """Drive laps side by side by pursuit of the centre line; None: not completed with all wheels on the track.
 
     In a race among others these are always half a lap away.
@@ -165,7 +165,7 @@ def drive_laps(setup: RaceSetup, drivers: Sequence[Driver]) -> list[DrivenLap | 
     ]
 
 
-def _bend_speed(setup: RaceSetup, now: Measures, drivers: Sequence[Driver]) -> Floats:
+def _bend_speed(setup: RaceSetup, now: Measures, drivers: Sequence[SimpleDriver]) -> Floats:
     """Return the highest speed from which a car can still brake for every bend that its driver sees ahead, (n,)."""
     track = setup.track
     lateral_mps2 = np.array([driver.lateral_mps2 for driver in drivers])
@@ -185,7 +185,7 @@ def _turn_rad(track: Track, ndist: Floats, around_m: float) -> Floats:
     return turn_rad
 
 
-def _steer(setup: RaceSetup, now: Measures, drivers: Sequence[Driver], time_s: float) -> Floats:
+def _steer(setup: RaceSetup, now: Measures, drivers: Sequence[SimpleDriver], time_s: float) -> Floats:
     """Return pure-pursuit steering angles in degrees, from the predicted pose to a point ahead, (n,)."""
     car, track = setup.car, setup.track
     speed_mps = np.maximum(now.speed_mps, 0.3)

@@ -168,7 +168,7 @@ class Others:
 
     def _drive(self, ids: Ids, track_index: TrackIndex, time_s: Floats) -> None:
         assert self._paths is not None
-        drive(ids, track_index, time_s, self._paths, self._manner, self._bots)
+        _drive_bots(ids, track_index, time_s, self._paths, self._manner, self._bots)
 
 
 def check_room(race: RaceConfig, tracks: Sequence[tuple[str, Track]]) -> None:
@@ -285,7 +285,7 @@ class Bots(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def drive(ids, track_index, time_s, paths, manner, bots):  # type: ignore[no-untyped-def]
+def _drive_bots(ids, track_index, time_s, paths, manner, bots):  # type: ignore[no-untyped-def]
     """Move the bots of the cars `ids` on their tracks to a time, (n,) each, and change their lanes."""
     speed_mps, pause_s, least_after_s, most_after_s, change_m = manner
     start_m, lane, changes, change_begin_s, change_end_s, seed, pauses, poses, distance_m, offset_m = bots

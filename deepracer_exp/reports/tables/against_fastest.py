@@ -25,7 +25,7 @@ _SAME_START_M = 0.05
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Loss:
+class TimeLoss:
     """The seconds that a lap loses to the fastest lap, by cause and sector."""
 
     fastest: FastestLap
@@ -54,7 +54,7 @@ def question_of(view: LogView, folder: Path) -> Question | None:
 
 
 @once_per_view
-def loss(view: LogView, folder: Path) -> Loss | None:
+def loss(view: LogView, folder: Path) -> TimeLoss | None:
     """Compare the run's fastest exploring lap from the start line, by a car on usual conditions, with the fastest lap.
 
     None: there is no such lap, or the fastest lap is not known.
@@ -69,7 +69,7 @@ def loss(view: LogView, folder: Path) -> Loss | None:
         return None
     driven = pd.DataFrame({name: fastest.column(name) for name in ("time_s", "x_m", "y_m")})
     sectors = sectors_of(question.track)
-    return Loss(
+    return TimeLoss(
         fastest=fastest,
         lap_time_s=float(lap["time_s"].iloc[-1]),
         by_sector=by_cause(
@@ -163,7 +163,7 @@ def loss_in_words(view: LogView, folder: Path) -> str:
     return f"no complete {view.lap_word} from the start line" if lost is None else lost_in_words(lost)
 
 
-def lost_in_words(lost: Loss) -> str:
+def lost_in_words(lost: TimeLoss) -> str:
     """Return a sentence with the losses and the worst sector."""
     total, causes = lost.lap_time_s - lost.fastest.lap_time_s, lost.by_sector.sum()
     by_sector = lost.by_sector.sum(axis=1)

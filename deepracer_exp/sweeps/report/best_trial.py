@@ -14,7 +14,14 @@ from deepracer_exp.reports.tables.evidence import Values, difference, estimate
 from deepracer_exp.runs.best_run import BestOfSweep, write_best_of_sweep
 from deepracer_exp.runs.run_files import is_run
 from deepracer_exp.runs.run_result import FRESH_LAPS, SWEEP_LAPS
-from deepracer_exp.sweeps.search.objectives import MEASURES, NONE, cost, objectives_of, shown, shown_values
+from deepracer_exp.sweeps.search.objectives import (
+    MEASURES,
+    NONE,
+    cost,
+    objectives_of,
+    score_text,
+    shown_values,
+)
 from deepracer_exp.sweeps.trial import SeedRun, Trial
 
 from .wording import parameter
@@ -153,8 +160,8 @@ def over_seeds(study: optuna.Study, keys: dict[str, str]) -> list[dict[str, Any]
         row = {
             "trial": trial.number,
             "seeds": score.seeds,
-            "iqm": shown(objective, score.iqm),
-            "interval": " to ".join(shown(objective, end) for end in score.interval or ()) or NONE,
+            "iqm": score_text(objective, score.iqm),
+            "interval": " to ".join(score_text(objective, end) for end in score.interval or ()) or NONE,
             "difference": NONE,
             "probability": NONE,
             "verdict": "the best" if trial.number == best.number else NONE,
@@ -163,7 +170,7 @@ def over_seeds(study: optuna.Study, keys: dict[str, str]) -> list[dict[str, Any]
         if trial.number != best.number and len(_values(best)):
             apart = difference([values], [_values(best)], MEASURES[objective].minimize)
             row |= {
-                "difference": NONE if apart.iqm is None else shown(objective, apart.iqm),
+                "difference": NONE if apart.iqm is None else score_text(objective, apart.iqm),
                 "probability": f"{apart.probability:.0%}",
                 "verdict": apart.verdict(),
             }

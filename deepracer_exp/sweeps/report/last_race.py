@@ -9,7 +9,7 @@ from deepracer_exp.config.sweep import SweepConfig
 from deepracer_exp.errors import count
 from deepracer_exp.runs.best_run import BestOfSweep, write_best_of_sweep
 from deepracer_exp.runs.run_result import BOTH, of_conditions
-from deepracer_exp.sweeps.search.objectives import shown, shown_or_dash
+from deepracer_exp.sweeps.search.objectives import score_text, shown_or_dash
 
 from .best_trial import complete_trials
 
@@ -82,9 +82,9 @@ class LastRace:
     def verdict(self) -> str:
         """Return a sentence with the policy to submit and the reason."""
         first, *others = self.racers
-        score = shown("race_score", first.race_score_s)
+        score = score_text("race_score", first.race_score_s)
         against = " and ".join(
-            f"{shown('race_score', other.race_score_s)} of {other.name}" for other in others
+            f"{score_text('race_score', other.race_score_s)} of {other.name}" for other in others
         )
         return f"Submit {first.name}: its {self.measure} on fresh laps is {score}, against {against}."
 
@@ -136,10 +136,10 @@ def race_rows(race: LastRace | None) -> list[dict[str, str]]:
         {
             "name": f"{racer.name[0].upper()}{racer.name[1:]}",
             "checkpoint": racer.checkpoint,
-            "score": shown("race_score", racer.race_score_s),
-            "interval": " to ".join(shown("race_score", end) for end in racer.interval),
+            "score": score_text("race_score", racer.race_score_s),
+            "interval": " to ".join(score_text("race_score", end) for end in racer.interval),
             "lap_time": shown_or_dash("lap_time", racer.lap_time_s),
-            "laps": shown("completion", racer.laps_percent),
+            "laps": score_text("completion", racer.laps_percent),
             "held_out_laps": shown_or_dash("completion", racer.held_out_laps_percent),
             "held_out": shown_or_dash("completion", racer.held_out_completion),
         }

@@ -22,7 +22,7 @@ from deepracer_exp.sweeps.search.objectives import (
     MEASURES,
     NONE,
     objectives_of,
-    shown,
+    score_text,
     shown_or_dash,
 )
 from deepracer_exp.sweeps.trial import Trial
@@ -248,9 +248,9 @@ def _winners(study: optuna.Study, objectives: Sequence[str], keys: dict[str, str
         tables.append(
             {
                 "trial": trial.number,
-                "now": ", ".join(map(shown, objectives, laps.values)),
-                "before": ", ".join(map(shown, objectives, trial.values)),
-                "interval": " to ".join(shown(objectives[0], end) for end in laps.interval),
+                "now": ", ".join(map(score_text, objectives, laps.values)),
+                "before": ", ".join(map(score_text, objectives, trial.values)),
+                "interval": " to ".join(score_text(objectives[0], end) for end in laps.interval),
                 "lap_time": shown_or_dash("lap_time", laps.lap_time_s),
                 "completion": shown_or_dash("completion", laps.completion),
                 "held_out": shown_or_dash("completion", laps.held_out_completion),

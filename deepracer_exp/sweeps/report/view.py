@@ -16,7 +16,7 @@ from rich.text import Text
 from deepracer_exp.errors import count
 from deepracer_exp.sweeps.queue.claims import Claim
 from deepracer_exp.sweeps.queue.worker_config import WorkerConfig
-from deepracer_exp.sweeps.search.objectives import NONE, cost, shown, shown_values
+from deepracer_exp.sweeps.search.objectives import NONE, cost, score_text, shown_values
 from deepracer_exp.sweeps.trial import Trial
 from deepracer_exp.training.display import LINE_COLUMNS, sparkline
 
@@ -168,7 +168,9 @@ def _values(trial: Trial, objectives: Sequence[str]) -> str:
     parts = [shown_values(objectives, trial.values or (), trial.held_out_completion is not None)]
     if "lap_time" not in objectives:
         parts.append(
-            "no lap" if trial.lap_time_s is None else f"mean usual lap {shown('lap_time', trial.lap_time_s)}"
+            "no lap"
+            if trial.lap_time_s is None
+            else f"mean usual lap {score_text('lap_time', trial.lap_time_s)}"
         )
     if "completion" not in objectives:
         parts.append(f"{trial.completion:.0f}% driven")

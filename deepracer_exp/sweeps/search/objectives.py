@@ -133,7 +133,7 @@ def intermediate_value(row: Mapping[str, Any], objective: str, trial_time_s: flo
     return without_lap(completion, trial_time_s) if value is None else float(value)
 
 
-def shown(objective: str, value: float) -> str:
+def score_text(objective: str, value: float) -> str:
     """Return a value with its unit: ``9.84 s``, ``97.3%``."""
     digits = 2 if MEASURES[objective].minimize else 1
     return with_unit(f"{value:.{digits}f}", MEASURES[objective].unit)
@@ -141,12 +141,13 @@ def shown(objective: str, value: float) -> str:
 
 def shown_or_dash(objective: str, value: float | None) -> str:
     """Return a value for a table: with its unit, or a dash."""
-    return NONE if value is None else shown(objective, value)
+    return NONE if value is None else score_text(objective, value)
 
 
 def shown_values(objectives: Sequence[str], values: Sequence[float], has_held_out: bool) -> str:
     """Return all values of a trial: ``lap time 9.84 s, completion 97.3%``; `has_held_out`: it drove held-out laps."""
     pairs = zip(objectives, values, strict=True)
     return ", ".join(
-        f"{of_conditions(MEASURES[name].words, has_held_out)} {shown(name, value)}" for name, value in pairs
+        f"{of_conditions(MEASURES[name].words, has_held_out)} {score_text(name, value)}"
+        for name, value in pairs
     )

@@ -5,7 +5,7 @@ import pytest
 
 from deepracer_exp.aws.validation.simple_driver import (
     SHARES,
-    Driver,
+    SimpleDriver,
     action_space_laps,
     drive_laps,
     flawed_laps,
@@ -103,7 +103,7 @@ def test_a_single_action_gives_one_lap(race):
 
 
 def test_a_bend_taken_too_fast_gives_no_lap(race):
-    assert drive_laps(race, [Driver(lateral_mps2=50.0)]) == [None]
+    assert drive_laps(race, [SimpleDriver(lateral_mps2=50.0)]) == [None]
 
 
 def test_each_lap_with_a_flaw_has_that_flaw_and_is_no_faster_than_the_good_one(race, laps):
