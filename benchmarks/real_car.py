@@ -43,9 +43,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from deepracer_exp.aws.export.car_converter import NEEDED, Conversion, compare_in_openvino, has_openvino
-from deepracer_exp.aws.export.car_export import car_archive
-from deepracer_exp.aws.export.onnx import DeployedPolicy
+from deepracer_exp.commands.export.car_converter import NEEDED, Conversion, compare_in_openvino, has_openvino
+from deepracer_exp.commands.export.car_export import car_archive
+from deepracer_exp.commands.export.onnx import DeployedPolicy
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.env.action_space import build_action_space

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 import yaml
 
-from deepracer_exp.aws.validation.pitfalls import lap_returns, slow_laps_return_as_much
-from deepracer_exp.aws.validation.simple_driver import action_space_laps
-from deepracer_exp.aws.validation.validate import read
 from deepracer_exp.cli import parse
 from deepracer_exp.commands.arguments import runs_and_overrides
+from deepracer_exp.commands.validation.pitfalls import lap_returns, slow_laps_return_as_much
+from deepracer_exp.commands.validation.simple_driver import action_space_laps
+from deepracer_exp.commands.validation.validate import read
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment, expand_grid
 from deepracer_exp.config.options import conf_dir, groups, options
 from deepracer_exp.config.sweep import compose_sweep

@@ -1,5 +1,6 @@
-"""All that the AWS service and its car read and write, on two floors.
+"""The formats of the AWS service and its car, read and written without anything else of ours.
 
-Formats, below everything else: `logs.reader.read_recording`, `models.model_metadata.ModelMetadata`,
-`models.archive`, `worlds.catalogue`. What drives and trains for them, above: `validation.validate`, `export.export`.
+`logs.reader.read_recording` reads logs, `models.model_metadata.ModelMetadata` action spaces, `models.archive` trained
+models, and `worlds.catalogue` finds the service's tracks. What drives and trains for them is in
+`commands.validation` and `commands.export`.
 """

@@ -210,7 +210,7 @@ def _of_track(what: str, is_route: bool, overrides: list[str], track: str | None
     if track is not None:
         raise BadInput(f"--track {track}: {what} is a track itself; accepted for a log of several tracks")
 
-    from deepracer_exp.aws.export.aws_files import services_metadata
+    from deepracer_exp.commands.export.aws_files import services_metadata
     from deepracer_exp.config.overrides import group_of, override_line
     from deepracer_exp.reports.tables.proposed_actions import commands_of_fastest
 
@@ -228,7 +228,7 @@ def _of_run(what: str, stores: Stores, track: str | None) -> _Source:
 
     run = stores.find(what).with_policy(stores.values.get("checkpoint"))
 
-    from deepracer_exp.aws.export.aws_files import services_metadata
+    from deepracer_exp.commands.export.aws_files import services_metadata
     from deepracer_exp.reports.pages.driven_laps import commands_of_run
 
     with warnings_on_stderr():

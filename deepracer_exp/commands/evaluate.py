@@ -158,7 +158,7 @@ def _check(args: argparse.Namespace) -> int:
         )
     _refuse_rival(plan, "--car")
 
-    from deepracer_exp.aws.export.car_check import check_run
+    from deepracer_exp.commands.export.car_check import check_run
 
     with warnings_on_stderr():
         picture = None if args.output is None else Path(args.output)

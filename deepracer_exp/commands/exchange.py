@@ -169,7 +169,7 @@ def _export(args: argparse.Namespace) -> int:
 
         check_car(run.experiment)
 
-    from deepracer_exp.aws.export.export import export
+    from deepracer_exp.commands.export.export import export
 
     with warnings_on_stderr():
         export(run, format, args.output, plain_console())
@@ -206,7 +206,7 @@ def _validate(args: argparse.Namespace) -> int:
         trial = replace(plan, experiment=short, composition=short_composition)
         start_workers_early(experiment.collector.forks)
 
-    from deepracer_exp.aws.validation.validate import validate_reward
+    from deepracer_exp.commands.validation.validate import validate_reward
 
     return validate_reward(plan, trial, args.output, args.strict, plain_console(), plain_console(stderr=True))
 

@@ -16,7 +16,15 @@ from deepracer_exp.tracks.track import TrackIndex, Tracks
 
 from .state import Measures
 
-OF_CAR = ("offset", "heading_error_sin", "heading_error_cos", "speed", "yaw_rate", "last_steering", "last_speed")
+OF_CAR = (
+    "offset",
+    "heading_error_sin",
+    "heading_error_cos",
+    "speed",
+    "yaw_rate",
+    "last_steering",
+    "last_speed",
+)
 """Features of the car on the road, in the order in which `_features` writes them."""
 OTHERS = ("gap", "side", "closing", "bot")
 """Features of each of the next boxes and bots, see `RaceOthers.features`."""

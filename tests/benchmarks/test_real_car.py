@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from benchmarks import real_car
-from deepracer_exp.aws.export.car_converter import has_openvino
+from deepracer_exp.commands.export.car_converter import has_openvino
 from tests.conftest import Ended
 
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from deepracer_exp.aws.validation import pitfalls
-from deepracer_exp.aws.validation.probe import Probe
-from deepracer_exp.aws.validation.reward_map import sample_reward_grid, state_of
-from deepracer_exp.aws.validation.simple_driver import flawed_laps
+from deepracer_exp.commands.validation import pitfalls
+from deepracer_exp.commands.validation.probe import Probe
+from deepracer_exp.commands.validation.reward_map import sample_reward_grid, state_of
+from deepracer_exp.commands.validation.simple_driver import flawed_laps
 
 
 def paying(expression: str) -> str:

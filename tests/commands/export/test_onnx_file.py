@@ -14,8 +14,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from deepracer_exp.agents.actor_critic import PolicyNetworks
 from deepracer_exp.agents.build import build_networks
-from deepracer_exp.aws.export import onnx as exporting
-from deepracer_exp.aws.export.onnx import TOLERANCE, DeployedPolicy, largest_difference, write_onnx
+from deepracer_exp.commands.export import onnx as exporting
+from deepracer_exp.commands.export.onnx import TOLERANCE, DeployedPolicy, largest_difference, write_onnx
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.env.action_space import ActionSpace, build_action_space

@@ -1,6 +1,6 @@
 import pytest
 
-from deepracer_exp.aws.validation.aws_rules import style_findings, text_findings
+from deepracer_exp.commands.validation.aws_rules import style_findings, text_findings
 
 GOOD = '''\
 import math

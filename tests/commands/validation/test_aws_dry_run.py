@@ -1,7 +1,7 @@
 import pytest
 
-from deepracer_exp.aws.validation.aws_dry_run import dry_run_findings, validator_params
-from deepracer_exp.aws.validation.aws_rules import text_findings
+from deepracer_exp.commands.validation.aws_dry_run import dry_run_findings, validator_params
+from deepracer_exp.commands.validation.aws_rules import text_findings
 
 ACCEPTED = [
     *("1.0", "float(params['steps'])", "np.float64(2.0)", "params['x']", "params['track_width']", "-1e5"),
@@ -111,7 +111,7 @@ def test_a_function_that_leaves_its_process_is_refused(findings, line):
 
 
 def test_a_function_that_hangs_is_refused(findings, monkeypatch):
-    monkeypatch.setattr("deepracer_exp.aws.validation.aws_dry_run._LIMIT_S", 0.2)
+    monkeypatch.setattr("deepracer_exp.commands.validation.aws_dry_run._LIMIT_S", 0.2)
     text = function("1.0", "while params['progress'] == 0:\n        pass\n    ")
     for hangs in (text, text.replace("progress'] == 0", "progress'] == 50")):
         (found,) = findings(hangs)

@@ -12,7 +12,7 @@ from deepracer_exp.aws.models.model_metadata import (
     beyond_console,
     model_metadata_text,
 )
-from deepracer_exp.aws.validation.aws_rules import text_findings
+from deepracer_exp.commands.validation.aws_rules import text_findings
 from deepracer_exp.config.custom_files.model_files import CARS, SAC_TAKEN, TAKEN
 from deepracer_exp.config.driving import ObservationConfig
 from deepracer_exp.config.experiment import Experiment

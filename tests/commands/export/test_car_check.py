@@ -9,9 +9,9 @@ from PIL import Image
 from rich.console import Console
 from tensordict import TensorDict
 
-from deepracer_exp.aws.export.car_check import CarCheck, CarLaps, print_check
-from deepracer_exp.aws.export.car_converter import Conversion
-from deepracer_exp.aws.export.car_export import CarArchive, car_actions
+from deepracer_exp.commands.export.car_check import CarCheck, CarLaps, print_check
+from deepracer_exp.commands.export.car_converter import Conversion
+from deepracer_exp.commands.export.car_export import CarArchive, car_actions
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment
 from deepracer_exp.config.driving import CameraConfig
 from deepracer_exp.env.action_space import DiscreteActions

@@ -11,9 +11,9 @@ import yaml
 
 from deepracer_exp.agents.actor_critic import build_actor_critic
 from deepracer_exp.agents.service_weights import VALUE, to_service
-from deepracer_exp.aws.export.aws_model import aws_model, services_kind
 from deepracer_exp.aws.models.model_metadata import NEURAL_NETWORKS, ModelMetadata, read_model_metadata
 from deepracer_exp.aws.models.tf_checkpoint import read_index, read_tensors
+from deepracer_exp.commands.export.aws_model import aws_model, services_kind
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.custom_files.model_files import sensor_overrides
 from deepracer_exp.config.named import network_overrides

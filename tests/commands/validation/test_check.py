@@ -2,9 +2,9 @@ import re
 
 import pytest
 
-from deepracer_exp.aws.validation import validate as checking
-from deepracer_exp.aws.validation.probe import NOT_CALLED, Probe, lines_for_step_1
-from deepracer_exp.aws.validation.reward_map import state_of
+from deepracer_exp.commands.validation import validate as checking
+from deepracer_exp.commands.validation.probe import NOT_CALLED, Probe, lines_for_step_1
+from deepracer_exp.commands.validation.reward_map import state_of
 from deepracer_exp.errors import BadInput
 
 

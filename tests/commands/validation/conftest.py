@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from deepracer_exp.aws.validation import reward_map
-from deepracer_exp.aws.validation import validate as checking
-from deepracer_exp.aws.validation.objects import with_others
-from deepracer_exp.aws.validation.simple_driver import DrivenLap, action_space_laps
-from deepracer_exp.aws.validation.validate import Check, look_closer, read, try_named_situations
+from deepracer_exp.commands.validation import reward_map
+from deepracer_exp.commands.validation import validate as checking
+from deepracer_exp.commands.validation.objects import with_others
+from deepracer_exp.commands.validation.simple_driver import DrivenLap, action_space_laps
+from deepracer_exp.commands.validation.validate import Check, look_closer, read, try_named_situations
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.driving import RewardConfig
 from deepracer_exp.config.experiment import Experiment

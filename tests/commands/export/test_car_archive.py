@@ -14,11 +14,11 @@ import torch
 from torch import nn
 
 from deepracer_exp.agents.build import build_networks
-from deepracer_exp.aws.export.car_export import CarArchive, car_actions, car_archive
-from deepracer_exp.aws.export.onnx import DeployedPolicy
 from deepracer_exp.aws.models.car_archive import check_weights, name_on_car
 from deepracer_exp.aws.models.graph_def import HEAD, INPUTS, POLICY, read_weights
 from deepracer_exp.aws.models.model_metadata import read_model_metadata
+from deepracer_exp.commands.export.car_export import CarArchive, car_actions, car_archive
+from deepracer_exp.commands.export.onnx import DeployedPolicy
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.action_space import ContinuousActions, build_action_space
 from deepracer_exp.env.observation import observation_shape

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from deepracer_exp.aws.validation import validate as checking
-from deepracer_exp.aws.validation.short_training import compare_thirds
 from deepracer_exp.aws.worlds.routes import world_rows
+from deepracer_exp.commands.validation import validate as checking
+from deepracer_exp.commands.validation.short_training import compare_thirds
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.reports.tables.line_file import racing_line_table, write_line
 from deepracer_exp.rewards.source import zoo_names

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from deepracer_exp.aws.validation.objects import object_outlines, with_others
-from deepracer_exp.aws.validation.situations import named_situations
-from deepracer_exp.aws.validation.validate import read
+from deepracer_exp.commands.validation.objects import object_outlines, with_others
+from deepracer_exp.commands.validation.situations import named_situations
+from deepracer_exp.commands.validation.validate import read
 from deepracer_exp.config.compose import compose_experiment
 
 AVOID = """def reward_function(params):

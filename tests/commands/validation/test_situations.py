@@ -3,14 +3,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from deepracer_exp.aws.validation.simple_driver import (
+from deepracer_exp.commands.validation.simple_driver import (
     SHARES,
     SimpleDriver,
     action_space_laps,
     drive_laps,
     flawed_laps,
 )
-from deepracer_exp.aws.validation.situations import named_situations, poses, sample, seam, situations, start
+from deepracer_exp.commands.validation.situations import (
+    named_situations,
+    poses,
+    sample,
+    seam,
+    situations,
+    start,
+)
 from deepracer_exp.config.driving import DiscreteAction, DiscreteActionSpace
 from deepracer_exp.env.action_space import build_action_space
 

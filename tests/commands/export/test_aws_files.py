@@ -2,10 +2,10 @@ import json
 
 import pytest
 
-from deepracer_exp.aws.export.aws_files import aws_files
-from deepracer_exp.aws.export.written import write_files
 from deepracer_exp.aws.models.hyperparameters import read_hyperparameters
 from deepracer_exp.aws.models.model_metadata import read_model_metadata
+from deepracer_exp.commands.export.aws_files import aws_files
+from deepracer_exp.commands.export.written import write_files
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.custom_files.model_files import read_custom_files, sensor_overrides
 from deepracer_exp.env.action_space import build_action_space

@@ -15,7 +15,7 @@ from deepracer_exp.tracks.track import Track
 
 from .aws_rules import AwsFinding, late_imports
 
-_MODULE = "deepracer_exp.aws.validation.aws_calls"
+_MODULE = "deepracer_exp.commands.validation.aws_calls"
 _LIMIT_S = 5.0
 """CPU seconds of a call."""
 _LONGEST_S = 120.0

@@ -1,4 +1,4 @@
-from deepracer_exp.aws.validation.coverage import Coverage, never_executed
+from deepracer_exp.commands.validation.coverage import Coverage, never_executed
 
 TEXT = '''\
 def helper(x):

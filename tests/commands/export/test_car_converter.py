@@ -9,13 +9,13 @@ import torch
 from tests.export.test_car_archive import LEFT, SHORT, exported, unpacked
 
 from benchmarks.camera import read_frames
-from deepracer_exp.aws.export.car_converter import (
+from deepracer_exp.aws.models.graph_def import INPUTS, POLICY
+from deepracer_exp.commands.export.car_converter import (
     Conversion,
     add_converted,
     compare_in_openvino,
     has_openvino,
 )
-from deepracer_exp.aws.models.graph_def import INPUTS, POLICY
 
 KINDS = [
     ("experiment=real_car",),
