@@ -136,7 +136,8 @@ def _train(args: argparse.Namespace) -> int:
 
     from deepracer_exp.reports.pages.run_page import RunReport
     from deepracer_exp.tracking.projector import Projector
-    from deepracer_exp.training.run import run_training, try_out
+    from deepracer_exp.training.new_run import try_out
+    from deepracer_exp.training.run import run_training
 
     if len(plans) > 1:
         for plan in plans:

@@ -1,6 +1,7 @@
 """The live view of a training in the terminal, and its plain lines where there is none."""
 
 import itertools
+import logging
 import math
 import textwrap
 import time
@@ -16,6 +17,8 @@ from rich.table import Table
 from rich.text import Text
 
 from deepracer_exp.tracking.mlflow_metrics import track_metric
+
+logger = logging.getLogger("deepracer_exp")
 
 Row = Mapping[str, float | int | None]
 """One line of metrics.jsonl."""
@@ -386,3 +389,15 @@ def _left(eta_s: float | None) -> str:
     if eta_s is None or not math.isfinite(eta_s):
         return f"{NOTHING} left"
     return f"{_AT_MOST}{_clock(max(eta_s, 0.0))} left"  # the last iteration may end past the budget
+
+
+def printing(console: Console) -> Callable[[str], None]:
+    """Return a function that prints a line as it is, above the progress view if there is one."""
+    return lambda line: console.print(line, soft_wrap=True)
+
+
+def print_lines(lines: Sequence[str], console: Console) -> None:
+    """Print lines above the progress view, and log them."""
+    for line in lines:
+        logger.info(line)
+        printing(console)(line)

@@ -128,7 +128,7 @@ def test_the_clock_begins_with_the_first_step_and_goes_on_where_it_stopped(cut, 
 
     run = cut()
     stored = read_training(check(run / "checkpoints" / "last"))["wall_clock_s"]
-    monkeypatch.setattr("deepracer_exp.training.run.Trainer", Watched)
+    monkeypatch.setattr("deepracer_exp.training.reopened_run.Trainer", Watched)
     ended = call("resume", run.name, "budget.iterations=4")
     assert ended.code == 0, ended.stderr
     assert seen == [(stored, stored)]
