@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from deepracer_exp.commands.output import Terminal
+from deepracer_exp.commands.terminal import Terminal
 from deepracer_exp.streams import shown
 
 COMMAND = (sys.executable, "-m", "deepracer_exp.cli")

@@ -226,7 +226,7 @@ def _watch(args: argparse.Namespace) -> int:
                 plan.rival,
             )
         return 0
-    from deepracer_exp.reports.pages.live_page import LiveServer
+    from deepracer_exp.reports.pages.live_server import LiveServer
 
     # Its first checkpoint may be still to come.
     plan = _planned(args, run, overrides, has_checkpoint=False)

@@ -10,10 +10,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console, ConsoleOptions, RenderableType
-from rich.segment import Segment
-from typing_extensions import override
-
 from deepracer_exp.cache import compiled_folder
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.runs.run_files import (
@@ -26,7 +22,6 @@ from deepracer_exp.runs.run_files import (
     read_metrics,
 )
 from deepracer_exp.runs.run_result import FAILED, RELIABLE, fastest_reliable, why_not_fastest
-from deepracer_exp.streams import shown
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -68,6 +63,8 @@ def plain_console(**options: Any) -> "Console":
     All consoles come from here. Past its console, Rich reads markup in the title of a panel, in a status and beside a
     progress bar: what stands there, names of studies and checkpoints, can have no brackets.
     """
+    from .terminal import Terminal
+
     return Terminal(markup=False, emoji=False, highlight=False, **options)
 
 
@@ -294,17 +291,3 @@ def _laps(summary: Mapping[str, Any]) -> str:
         return f"laps on {sum(track['laps'] > 0 for track in tracks.values())} of {len(tracks)} tracks"
     best = summary["best_lap_time_s"]
     return f"{count(summary['laps'], 'lap')}, the fastest in {best:.2f} s" if best is not None else "no lap"
-
-
-class Terminal(Console):
-    """A console of Rich that removes control characters from cells and lines, but writes its own styles."""
-
-    def __init__(self, *, stderr: bool = False, **options: Any) -> None:
-        """Write to standard output or error; `options` are those of Rich's console."""
-        stream = sys.stderr if stderr else sys.stdout
-        super().__init__(stderr=stderr, **{"file": getattr(stream, "as_is", stream), **options})
-
-    @override
-    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
-        for segment in super().render(renderable, options):
-            yield segment if segment.control else Segment(shown(segment.text), segment.style)

@@ -31,7 +31,8 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.film import Lap, LapRecorder, drive_best_lap, in_frames, write_film
 from deepracer_exp.reports.pages import live_page as live
-from deepracer_exp.reports.pages.live_page import LivePage, LiveServer, track_lines
+from deepracer_exp.reports.pages.live_page import LivePage, track_lines
+from deepracer_exp.reports.pages.live_server import LiveServer
 from deepracer_exp.reports.pages.sight import picture_of, saliency
 from deepracer_exp.reports.pages.watch import HEIGHT, WIDTH, Frames, rays
 from deepracer_exp.runs.run_files import read_metrics

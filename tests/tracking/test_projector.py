@@ -89,8 +89,7 @@ time.sleep(600)
 """
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as owner:
         assert owner.stdout.readline() == b"open\n"
-        children = processes(psutil.Process(owner.pid))
-        assert children
+        children = wait_until(lambda: processes(psutil.Process(owner.pid)), "process for the tracker")
         os.kill(owner.pid, signal.SIGKILL)
         wait_until(lambda: not any(child.is_running() for child in children), "end of the process")
 

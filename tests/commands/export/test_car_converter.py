@@ -6,7 +6,6 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import torch
-from tests.export.test_car_archive import LEFT, SHORT, exported, unpacked
 
 from benchmarks.camera import read_frames
 from deepracer_exp.aws.models.graph_def import INPUTS, POLICY
@@ -16,6 +15,7 @@ from deepracer_exp.commands.export.car_converter import (
     compare_in_openvino,
     has_openvino,
 )
+from tests.commands.export.test_car_archive import LEFT, SHORT, exported, unpacked
 
 KINDS = [
     ("experiment=real_car",),
