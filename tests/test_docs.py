@@ -29,9 +29,7 @@ ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 GENERATED = {"commands.md", "configuration.md"}
 LONG_GUIDES = {
-    "evaluation.md",
     "extending.md",
-    "faster_laps.md",
     "gallery.md",
     "lineage.md",
     "randomization.md",
