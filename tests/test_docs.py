@@ -29,7 +29,6 @@ ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 GENERATED = {"commands.md", "configuration.md"}
 LONG_GUIDES = {
-    "extending.md",
     "gallery.md",
     "lineage.md",
     "randomization.md",
@@ -135,7 +134,7 @@ def _path_restored(monkeypatch):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Return a working folder with the files that the commands name, among them those of docs/extending.md."""
+    """Return a working folder with the files that the commands name, among them those of our examples."""
     folder = tmp_path_factory.mktemp("docs")
     write_examples(folder)
     for name in ("DIR", "model_1", "model_2"):
@@ -175,7 +174,7 @@ def test_every_command_shown_is_accepted(words, folder, monkeypatch):
 
 
 def _examples():
-    page = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "from_python.md").read_text(encoding="utf-8")
     return re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
 
 

@@ -1,4 +1,4 @@
-"""Classes of the user's own: the examples of docs/extending.md are trained, resumed, raced and refused."""
+"""Classes of the user's own: the examples of docs/own_classes.md are trained, resumed, raced and refused."""
 
 import json
 import re
@@ -21,7 +21,7 @@ from deepracer_exp.runs.next_steps import command_line, next_steps
 
 from .conftest import IN_PROCESS, call_in
 
-PAGE = Path(__file__).parents[1] / "docs" / "extending.md"
+DOCS = Path(__file__).parents[1] / "docs"
 OWN = (
     *("network=my_network:ResidualNet", "network.kwargs.width=16"),
     *("algorithm=my_algorithm:DecayedPPO", "algorithm.kwargs.decay=1e-3"),
@@ -40,7 +40,8 @@ TIMES = ["wall_clock_s", "collect_s", "update_s", "env_steps_per_s"]
 
 
 def write_examples(folder: Path) -> Path:
-    text = PAGE.read_text(encoding="utf-8")
+    pages = (DOCS / name for name in ("extending.md", "own_classes.md"))
+    text = "".join(page.read_text(encoding="utf-8") for page in pages)
     for name, content in re.findall(r'^```\w+ title="([^"]+)"\n(.*?)^```', text, re.DOTALL | re.MULTILINE):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(content, encoding="utf-8")
