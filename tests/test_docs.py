@@ -30,8 +30,6 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").r
 GENERATED = {"commands.md", "configuration.md"}
 LONG_GUIDES = {
     "gallery.md",
-    "lineage.md",
-    "randomization.md",
     "scaling.md",
     "upgrade.md",
 }

@@ -12,6 +12,7 @@ from deepracer_exp.runs.trace import read_trace
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "randomization.md").read_text(encoding="utf-8")
+KEYS = (ROOT / "docs" / "randomization_keys.md").read_text(encoding="utf-8")
 OVERRIDES = ("randomization=sim2real", "reward=speed_on_track", "episode.max_steps=60")
 
 
@@ -38,8 +39,8 @@ def test_the_pages_question_to_a_trace_is_answered(trained, monkeypatch, capsys)
 
 
 def table(number: int) -> tuple[list[str], list[list[str]]]:
-    """Return head and rows of a table of the page."""
-    tables = [text for text in re.split(r"\n(?!\|)", PAGE) if "\n|---" in text]
+    """Return head and rows of a table of the page of keys."""
+    tables = [text for text in re.split(r"\n(?!\|)", KEYS) if "\n|---" in text]
     lines = [line for line in tables[number].splitlines() if line.startswith("|")]
     header, _, *rows = [[cell.strip().strip("`") for cell in line.strip("|").split("|")] for line in lines]
     return header, rows
@@ -57,7 +58,7 @@ def test_the_pages_table_says_what_the_options_do(option):
 
 
 def test_the_pages_table_says_what_pictures_differ_in():
-    header, rows = table(2)
+    header, rows = table(1)
     content = yaml.safe_load((ROOT / "conf" / "randomization" / "sim2real.yaml").read_text(encoding="utf-8"))
     expected = {name: f"{low:g} to {high:g}" for name, (low, high) in content["pictures"].items()}
     assert {row[0]: row[header.index("sim2real")] for row in rows} == expected
