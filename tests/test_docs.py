@@ -28,11 +28,7 @@ from tests.test_own_classes import write_examples
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 GENERATED = {"commands.md", "configuration.md"}
-LONG_GUIDES = {
-    "gallery.md",
-    "scaling.md",
-    "upgrade.md",
-}
+LONG_GUIDES = {"gallery.md", "upgrade.md"}
 
 
 def _name(page):
