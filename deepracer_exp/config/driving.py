@@ -1,6 +1,6 @@
 """Track, action space, observation, randomization, episode rules and reward."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 from pydantic import AfterValidator, Discriminator, Field, Tag
@@ -285,9 +285,20 @@ class RandomizationConfig:
     """Share of the cars that are randomized."""
 
 
-_OTHER_KEYS = ("pictures", "real_car", "car_share")
-"""Keys of `RandomizationConfig` that are not ranges; their draws are not in the trace."""
-QUANTITIES = tuple(field.name for field in fields(RandomizationConfig) if field.name not in _OTHER_KEYS)
+QUANTITIES = {
+    "friction_scale": "factor on the grip of the tyres",
+    "mass_scale": "factor on all masses",
+    "motor_scale": "factor on the motors' gain and torque",
+    "servo_scale": "factor on the steering servos' gain",
+    "battery_sag": "share of the commanded speed lost in the end",
+    "action_delay_steps": "control steps by which commands are delayed",
+    "steering_offset_deg": "degrees added to the steering, positive to the left",
+    "steering_noise_deg": "degrees, standard deviation of the noise on the steering",
+    "speed_noise": "standard deviation of the noise on the speed, as a fraction of it",
+    "observation_noise": "standard deviation of the noise on measured features",
+    "observation_dropout": "probability that the last observation is repeated",
+}
+"""Meaning and unit of each quantity that `RandomizationConfig` has a range for; each is a column of the trace."""
 OFF = {name: 1.0 if name.endswith("_scale") else 0.0 for name in QUANTITIES}
 """The value of each quantity that has no effect."""
 

@@ -6,6 +6,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from deepracer_exp.config.driving import QUANTITIES
+
 EPISODE_STATUS = (
     "prepare",
     "in_progress",
@@ -21,21 +23,6 @@ EPISODE_STATUS = (
 """The service's names; the position is the code in packed rows. An episode that reaches the limit of steps is
 `time_up`."""
 STATUS_CODE = {status: code for code, status in enumerate(EPISODE_STATUS)}
-
-RANDOMIZED = {
-    "friction_scale": "factor on the grip of the tyres",
-    "mass_scale": "factor on all masses",
-    "motor_scale": "factor on the motors' gain and torque",
-    "servo_scale": "factor on the steering servos' gain",
-    "battery_sag": "share of the commanded speed lost in the end",
-    "action_delay_steps": "control steps by which commands are delayed",
-    "steering_offset_deg": "degrees added to the steering, positive to the left",
-    "steering_noise_deg": "degrees, standard deviation of the noise on the steering",
-    "speed_noise": "standard deviation of the noise on the speed, as a fraction of it",
-    "observation_noise": "standard deviation of the noise on measured features",
-    "observation_dropout": "probability that the last observation is repeated",
-}
-"""Columns of the randomized quantities (`conf/randomization/`), one value an episode, with their units."""
 
 _STATUS = pa.dictionary(pa.int8(), pa.string())
 _TRACK = pa.dictionary(pa.int16(), pa.string())
@@ -64,7 +51,7 @@ _COLUMNS: tuple[tuple[str, pa.DataType, str], ...] = (
     ("track", _TRACK, "name of the course"),
     ("iteration", pa.int32(), "policy update that used the row, from 1"),
     ("speed_mps", pa.float32(), "m/s measured"),
-    *((name, pa.float32(), unit) for name, unit in RANDOMIZED.items()),
+    *((name, pa.float32(), unit) for name, unit in QUANTITIES.items()),
 )
 TRACE_COLUMNS = tuple(name for name, _, _ in _COLUMNS)
 """Columns of a written trace."""

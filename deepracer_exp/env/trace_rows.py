@@ -6,23 +6,24 @@ from typing import NamedTuple
 
 import numpy as np
 
+from deepracer_exp.config.driving import QUANTITIES
 from deepracer_exp.jit import compiled
 
 from .rule_passes import nearer_of
-from .trace_columns import PACKED_COLUMNS, RANDOMIZED
+from .trace_columns import PACKED_COLUMNS
 
 
 def row_dtype(extra: Sequence[str] = ()) -> np.dtype[np.void]:
     """Return the record type of a packed row, with these columns after the others.
 
-    Its fields are those of `PACKED_COLUMNS`; the columns of `RANDOMIZED`, which are adjacent, are one, `randomized`.
+    Its fields are those of `PACKED_COLUMNS`; the columns of `QUANTITIES`, which are adjacent, are one, `randomized`.
     """
     fields: list[tuple[str, str] | tuple[str, str, int]] = []
     for name in (*PACKED_COLUMNS, *extra):
-        if name not in RANDOMIZED:
+        if name not in QUANTITIES:
             fields.append((name, "f8"))
         elif fields[-1][0] != "randomized":
-            fields.append(("randomized", "f8", len(RANDOMIZED)))
+            fields.append(("randomized", "f8", len(QUANTITIES)))
     return np.dtype(fields)
 
 
@@ -49,7 +50,7 @@ class Driven(NamedTuple):
     terminated: np.ndarray
     truncated: np.ndarray
     randomized: np.ndarray
-    """Quantities of `trace.RANDOMIZED`, (N, Q)."""
+    """Values of `QUANTITIES`, (N, Q)."""
 
 
 class Lengths(NamedTuple):

@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from deepracer_exp.config.driving import QUANTITIES
 from deepracer_exp.env.trace_columns import (
     EPISODE_STATUS,
     PACKED,
     PACKED_COLUMNS,
-    RANDOMIZED,
     SCHEMA,
     STATUS_CODE,
     TRACE_COLUMNS,
@@ -225,7 +225,7 @@ def test_the_records_that_a_race_writes_are_the_packed_columns_in_their_order():
     places = {name: kind[1] // 8 for name, kind in records.fields.items()}
     randomized = places.pop("randomized")
     expected = {**PACKED, **{name: len(PACKED) + number for number, name in enumerate(extra)}}
-    assert [expected.pop(name) for name in RANDOMIZED] == list(
-        range(randomized, randomized + len(RANDOMIZED))
+    assert [expected.pop(name) for name in QUANTITIES] == list(
+        range(randomized, randomized + len(QUANTITIES))
     )
     assert places == expected
