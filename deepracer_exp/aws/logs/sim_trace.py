@@ -284,9 +284,8 @@ class _Rows:
         """Reasons by the index of the line."""
         self._columns: dict[str, Any] = {
             "episode_status": pa.repeat("", count),
+            **{name: np.full(count, math.nan) for name in LATER[1:]},
             "pause_duration": np.zeros(count),
-            "obstacle_crash_counter": np.full(count, math.nan),
-            "wall_clock": np.full(count, math.nan),
             "values": np.full(count, min(width, 127), np.int8),
         }
 
