@@ -45,7 +45,7 @@ def test_a_reader_that_has_left_is_no_error_of_ours(tmp_path, closed_pipe):
 def test_what_cannot_be_read_any_more_does_not_end_a_command_halfway(tmp_path, closed_pipe):
     code = """
 import sys
-from deepracer_exp.commands.output import Terminal
+from deepracer_exp.commands.terminal import Terminal
 from deepracer_exp.streams import exit_code, standard_streams
 with standard_streams() as output:
     for _ in range(100):
