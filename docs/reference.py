@@ -1,21 +1,20 @@
-"""The two generated pages of the site: the command line, from its parser, and the configuration, from conf/.
+"""Write the two generated pages: the command line, from its parser, and the configuration, from conf/.
 
-MkDocs calls `on_files` of this module as a hook (mkdocs.yml); nothing is written to disk.
+`python docs/reference.py` writes docs/commands.md and docs/configuration.md.
 """
 
 import argparse
 import re
 from collections.abc import Iterator
+from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING
+from textwrap import dedent, fill
 
 import yaml
 
+from deepracer_exp.cli import build_parser
 from deepracer_exp.config.options import conf_dir, options_of
-
-if TYPE_CHECKING:
-    from mkdocs.config.defaults import MkDocsConfig
-    from mkdocs.structure.files import Files
+from deepracer_exp.runs.run_files import RUN
 
 COMMANDS_HEAD = """\
 # Command line
@@ -40,6 +39,11 @@ and names of runs.
 | 2 | bad input; one line names the file, the key and the value, and says what would be accepted |
 | 3 | the run failed |
 | 130, 143 | interrupted by Ctrl-C, ended by SIGTERM |
+
+`deepracer-exp COMMAND --help` prints the same in the terminal.
+
+| command | |
+|---|---|
 """
 
 CONFIGURATION_HEAD = """\
@@ -49,44 +53,90 @@ An experiment is one option of each group below, plus a value for any key you wa
 
     deepracer-exp train track=Oval_track reward=racing_line algorithm.lr=3e-4
 
-`deepracer-exp train --options GROUP` lists the options of a group, and `deepracer-exp train ... --cfg` prints the whole
-experiment without running it. YAML files of your own in `./conf/GROUP/` are options, too.
+`deepracer-exp train --options GROUP` lists the options of a group, `deepracer-exp tracks` the [tracks](tracks.md) with
+their lengths, and `deepracer-exp train ... --cfg` prints the whole experiment without running it. YAML files of your
+own in `./conf/GROUP/` are options, too.
 
-In the tables the default option is in bold. The listings under a table are the options that explain the group's keys.
+In the tables the default option is in bold. The files under a table are options that together explain the group's keys.
+
+| group | default | |
+|---|---|---|
+"""
+
+SWEEP_HEAD = """
+## sweep
+
+A sweep has keys of its own; `deepracer-exp sweep sweep=NAME` chooses a [ready-made one](sweeps.md#what-is-searched).
 """
 
 
-def parsers(parser: argparse.ArgumentParser, name: str) -> Iterator[tuple[str, argparse.ArgumentParser]]:
-    """Yield each command that takes arguments of its own, as (full name, parser), in the order of `--help`."""
-    nested = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
-    if not nested or any(not action.required for action in nested):
-        yield name, parser
-    for action in nested:
-        for word, below in dict(action.choices).items():
-            yield from parsers(below, f"{name} {word}".strip())
-
-
 def commands_page() -> str:
-    """Return the page of all commands, from the parser's own help texts."""
-    from deepracer_exp.cli import build_parser
-
-    text = COMMANDS_HEAD
-    for name, parser in parsers(build_parser(), ""):
-        parser.formatter_class = _WideHelp
-        description, parser.description = parser.description or "", None
-        text += f"\n## {name}\n\n{description}\n\n```text\n{parser.format_help().strip()}\n```\n"
-    return text
+    """Return the page of all commands: an index, and a section for each from its parser."""
+    commands = list(_commands(build_parser()))
+    index = "".join(
+        f"| [`{name}`](#{name.replace(' ', '-')}) | {summary} |\n" for name, summary, _ in commands
+    )
+    return COMMANDS_HEAD + index + "".join(_section(name, parser) for name, _, parser in commands)
 
 
-class _WideHelp(argparse.RawDescriptionHelpFormatter):
-    def __init__(self, prog: str) -> None:
-        super().__init__(prog, max_help_position=30, width=110)
+def _commands(
+    parser: argparse.ArgumentParser, family: str = ""
+) -> Iterator[tuple[str, str, argparse.ArgumentParser]]:
+    """Yield each command as (full name, summary, parser), in the order of `--help`."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for choice in action._choices_actions:
+                name = f"{family} {choice.dest}".strip()
+                yield name, choice.help or "", action.choices[choice.dest]
+                yield from _commands(action.choices[choice.dest], name)
+
+
+def _section(name: str, parser: argparse.ArgumentParser) -> str:
+    """Return the section of a command, not in argparse's layout, which differs between versions of Python."""
+    parts = [f"## {name}", f"`{_usage(parser)}`", _wrapped(parser.description or "")]
+    arguments = [
+        _wrapped(f"- {_argument(action)}: {action.help}", indent="  ")
+        for action in parser._actions
+        # The head of the page explains RUN and --help.
+        if action.help not in (None, RUN) and not isinstance(action, argparse._HelpAction)
+    ]
+    parts.append("\n".join(arguments))
+    paragraphs = (parser.epilog or "").strip("\n").split("\n\n")
+    for is_code, group in groupby(paragraphs, lambda paragraph: "  " in paragraph):  # aligned: examples
+        text = "\n\n".join(group)
+        parts.append(f"```text\n{dedent(text)}\n```" if is_code else text)
+    return "\n" + "\n\n".join(filter(None, parts)) + "\n"
+
+
+def _usage(parser: argparse.ArgumentParser) -> str:
+    """Return the command with its arguments and required flags; the list under it has the other flags."""
+    parser.formatter_class = lambda prog: argparse.HelpFormatter(prog, width=1000)
+    parser.color = False  # since Python 3.14
+    usage = " ".join(parser.format_usage().split()).removeprefix("usage: ")
+    # A run and overrides come in any order, so that argparse does not know that the run is required.
+    return re.sub(r"\[(-|OPTION)[^]]*\] ", "", usage).replace("[RUN]", "RUN")
+
+
+def _argument(action: argparse.Action) -> str:
+    """Return the names of an argument and its value, as code."""
+    names = list(action.option_strings)
+    value = action.metavar or "|".join(action.choices or [action.dest.upper()])
+    if action.nargs != 0:
+        names[-1:] = [" ".join([*names[-1:], str(value)])]
+    return ", ".join(f"`{name}`" for name in names)
+
+
+def _wrapped(text: str, indent: str = "") -> str:
+    return fill(text, 120, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
 
 
 def configuration_page() -> str:
     """Return the page of all groups, with their options and keys, from the files of conf/."""
+    groups = train_groups()
     text = CONFIGURATION_HEAD
-    for group, default, purpose in train_groups():
+    for group, default, purpose in groups:
+        text += f"| [`{group}`](#{group}) | {f'`{default}`' if default else 'none'} | {purpose} |\n"
+    for group, default, purpose in groups:
         text += f"\n## {group}\n\n{purpose}\n\n| option | |\n|---|---|\n"
         described = options_of(group)
         for option, sentence in described.items():
@@ -95,10 +145,10 @@ def configuration_page() -> str:
                 text += f"| {name} | {sentence} |\n"
         others = [f"`{option}`" for option, sentence in described.items() if not sentence]
         if others:
-            text += f"\nFurther options: {', '.join(others)}.\n"
+            text += "\n" + _wrapped(f"Further options: {', '.join(others)}.") + "\n"
         text += "".join(map(_listing, _explaining(group, default)))
     text += "\n## Keys of the experiment itself\n" + _listing(conf_dir() / "train.yaml")
-    text += "\n## sweep\n\nA sweep has keys of its own; `deepracer-exp sweep sweep=NAME` chooses a ready-made one.\n"
+    text += SWEEP_HEAD
     text += _listing(conf_dir() / "sweep.yaml") + _listing(conf_dir() / "sweep" / "own.yaml")
     return text + "\n## Keys of `deepracer-exp evaluate`\n" + _listing(conf_dir() / "evaluate.yaml")
 
@@ -125,13 +175,12 @@ def _explaining(group: str, default: str | None) -> list[Path]:
 
 
 def _listing(path: Path) -> str:
-    return f'\n```yaml title="conf/{path.relative_to(conf_dir())}"\n{path.read_text().strip()}\n```\n'
+    listing = path.read_text(encoding="utf-8").strip()
+    return f"\n`conf/{path.relative_to(conf_dir()).as_posix()}`:\n\n```yaml\n{listing}\n```\n"
 
 
-def on_files(files: "Files", config: "MkDocsConfig") -> "Files":
-    """Add the generated pages to the site."""
-    from mkdocs.structure.files import File
+PAGES = {"commands.md": commands_page, "configuration.md": configuration_page}
 
-    for name, content in (("commands.md", commands_page()), ("configuration.md", configuration_page())):
-        files.append(File.generated(config, name, content=content))
-    return files
+if __name__ == "__main__":
+    for file, page in PAGES.items():
+        Path(__file__).with_name(file).write_text(page(), encoding="utf-8")

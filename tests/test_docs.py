@@ -27,7 +27,6 @@ from tests.test_own_classes import write_examples
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-GENERATED = {"commands.md", "configuration.md"}
 LONG_GUIDES = {"gallery.md", "upgrade.md"}
 
 
@@ -62,8 +61,16 @@ def test_every_linked_file_and_heading_exists(page):
             assert not anchor or anchor in _anchors(target), f"{link}#{anchor}"
 
 
+@pytest.mark.parametrize("name", ["commands.md", "configuration.md"])
+def test_a_generated_page_is_what_its_generator_writes(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # without options of its own
+    page = _reference().PAGES[name]()
+    committed = (ROOT / "docs" / name).read_text(encoding="utf-8")
+    assert committed == page, f"docs/{name} is out of date: `python docs/reference.py` writes it"
+
+
 def test_the_configuration_page_has_every_group_and_option_and_the_default_in_bold():
-    page = _reference().configuration_page()
+    page = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
     defaults = yaml.safe_load((conf_dir() / "train.yaml").read_text(encoding="utf-8"))["defaults"]
     chosen = {
         group: option for entry in defaults if isinstance(entry, dict) for group, option in entry.items()
@@ -76,7 +83,8 @@ def test_the_configuration_page_has_every_group_and_option_and_the_default_in_bo
 
 
 def test_the_page_of_commands_has_every_command():
-    headings = set(re.findall(r"^## (.+)$", _reference().commands_page(), re.MULTILINE))
+    page = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
+    headings = set(re.findall(r"^## (.+)$", page, re.MULTILINE))
     assert {"train", "evaluate", "compare", "runs clean", "sweep", "ui"} <= headings
 
 
@@ -84,7 +92,7 @@ def test_the_site_lists_every_page():
     listed = re.findall(r": ([\w/]+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
     docs = ROOT / "docs"
     pages = {path.relative_to(docs).as_posix() for path in docs.rglob("*.md")}
-    assert sorted(listed) == sorted(pages | GENERATED)
+    assert sorted(listed) == sorted(pages)
 
 
 def test_a_guide_has_at_most_900_words():
@@ -109,9 +117,14 @@ def test_the_picture_of_the_layers_shows_those_that_are_checked():
 
 
 def _commands():
-    """Return every command that a page shows in a block of code, without its comment; each once."""
+    """Return every command that a page shows in a block of code, without its comment; each once.
+
+    The examples of docs/commands.md are the program's own, with explanations that are no comments of a shell.
+    """
     shown = {}
     for page in PAGES:
+        if page.name == "commands.md":
+            continue
         text = page.read_text(encoding="utf-8").replace("\\\n", "")
         for line in re.findall(r"^(?:    |\$ )?(deepracer-exp .*)$", text, re.MULTILINE):
             words = shlex.split(line, comments=True)
