@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from deepracer_exp.errors import BadInput, count, writing
 from deepracer_exp.runs.run_files import REPORT
 
-from .arguments import add_command, add_run, read_stores, runs_and_overrides
+from .arguments import STORES_METAVAR, add_command, add_run, read_stores, runs_and_overrides
 from .output import check_file
 from .pages import (
     add_page,
@@ -50,7 +50,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     )
     add_run(
         parser,
-        "runs_dir=DIR | tracking.uri=URI",
+        STORES_METAVAR,
         many=True,
         metavar="RUN | LOGS",
         help="a run, or logs of the service",

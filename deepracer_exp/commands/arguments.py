@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 STORES = ("runs_dir", "tracking.uri")
 """The folder of runs, and the MLflow store in which ids and aliases are looked up."""
+STORES_METAVAR = "runs_dir=DIR | tracking.uri=URI"
+"""The words of a command's help for overrides of the two."""
 
 _OVERRIDE = re.compile(r"[+~]*[A-Za-z_][\w./@-]*=.*", re.DOTALL)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.runs.run_files import CONFIG, is_run
 
-from .arguments import STORES, Stores, add_command, add_run, read_stores, runs_and_overrides
+from .arguments import STORES, STORES_METAVAR, Stores, add_command, add_run, read_stores, runs_and_overrides
 from .compare_runs import compare_runs
 from .output import check_file, print_table, table_console
 from .pages import (
@@ -58,7 +58,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     )
     add_run(
         parser,
-        f"GROUP=RUN,RUN,... | {' | '.join(f'{key}=...' for key in STORES)}",
+        f"GROUP=RUN,RUN,... | {STORES_METAVAR}",
         many=True,
     )
     parser.usage = (
@@ -71,7 +71,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         "--format",
         choices=("table", "json", "csv"),
         default="table",
-        help="of the output: json has groups, differences and learning curves, csv the curves",
+        help="format of the output: json has groups, differences and learning curves, csv the curves",
     )
 
 

@@ -68,11 +68,11 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         entry="evaluate",
     )
     add_run(parser, "checkpoint=NAME | evaluation.KEY=VALUE | KEY=VALUE")
-    parser.add_argument("--car", action="store_true", required=True, help="for the physical car")
+    parser.add_argument("--car", action="store_true", required=True, help="check for the physical car")
     parser.add_argument(
         *("-o", "--output"),
         metavar="FILE",
-        help="picture of the pictures that decide badly (.png; default: films/ in the run's folder)",
+        help="file to write these pictures to (.png; default: films/ in the run's folder)",
     )
 
     parser = add_command(

@@ -179,7 +179,8 @@ def _export(args: argparse.Namespace) -> int:
 _VALIDATE_EPILOG = """\
   deepracer-exp validate reward=racing_line                 from the reward zoo, on the default track
   deepracer-exp validate reward.file=my_reward.py track=Oval_track
-  deepracer-exp validate reward.file=my_reward.py trial=60s also train for that long: do reward and progress rise?
+  deepracer-exp validate reward.file=my_reward.py trial=60s
+                                                            also train for that long: do reward and progress rise?
 
 exit code: 0 it can be trained, even with warnings; 2 it cannot, or with --strict deepracer-on-aws would refuse it
 """

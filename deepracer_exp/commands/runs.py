@@ -10,7 +10,7 @@ from deepracer_exp.errors import BadInput, count
 from deepracer_exp.runs.run_files import full_name
 
 from .arguments import (
-    STORES,
+    STORES_METAVAR,
     add_command,
     add_overrides,
     add_run,
@@ -76,7 +76,6 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     actions = family.add_subparsers(metavar="ACTION", required=True)
-    where = " | ".join(f"{key}=..." for key in STORES)
 
     add_list(actions)
 
@@ -88,7 +87,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         description="Show what a run was cloned from and its clones, what each clone changed and achieved, and the "
         "best of each generation. Reads only the folders of the runs.",
     )
-    add_run(lineage, where)
+    add_run(lineage, STORES_METAVAR)
 
     promote = add_command(
         actions,
@@ -98,7 +97,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         description="Register a checkpoint as a version of a model in MLflow and give it an alias, by which evaluate, "
         "export and clone find it. From then on nothing removes it from the run's folder.",
     )
-    add_run(promote, f"checkpoint=best|last|fastest|N | {where}")
+    add_run(promote, f"checkpoint=best|last|fastest|N | {STORES_METAVAR}")
     promote.add_argument("--model", help="name of the model (default: the experiment's)")
     promote.add_argument(
         "--alias",
@@ -116,7 +115,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         description="List what can be removed from the folders of the runs, with sizes; with --apply, remove it.",
         epilog=_CLEAN_EPILOG,
     )
-    add_overrides(clean, where)
+    add_overrides(clean, STORES_METAVAR)
     clean.add_argument("--apply", action="store_true", help="remove what is listed")
     clean.add_argument(
         "--traces",
@@ -136,8 +135,8 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         help="open the MLflow pages of the recorded runs",
         description="Serve the MLflow pages of the project's runs on 127.0.0.1 until Ctrl-C.",
     )
-    add_overrides(ui, "runs_dir=DIR | tracking.uri=URI")
-    ui.add_argument("--port", type=port, default=5000)
+    add_overrides(ui, STORES_METAVAR)
+    ui.add_argument("--port", type=port, default=5000, help="port of the pages (default: 5000)")
 
 
 def with_default_action(arguments: list[str]) -> list[str]:

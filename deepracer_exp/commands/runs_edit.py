@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deepracer_exp.errors import BadInput, count
-from deepracer_exp.runs.run_files import full_name, run_folders
+from deepracer_exp.runs.run_files import RUN, full_name, run_folders
 
 from .arguments import (
     STORES,
+    STORES_METAVAR,
     Stores,
     add_command,
     add_overrides,
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
 
 def add_edits(actions: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the commands."""
-    where = " | ".join(f"{key}=..." for key in STORES)
     send = add_command(
         actions,
         "send",
@@ -38,7 +38,7 @@ def add_edits(actions: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
         description="Record in MLflow, from the folders of ended runs, what it lacks because it did not answer or "
         "refused; without RUN, of all runs of this store in runs_dir.",
     )
-    add_run(send, where, many=True)
+    add_run(send, STORES_METAVAR, many=True)
     for name, call, what, value in (
         ("rename", _rename, "name a run; commands find it by this name, too", "NAME"),
         ("note", _note, "write a note to a run", "TEXT"),
@@ -49,14 +49,14 @@ def add_edits(actions: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
             name,
             call,
             help=what,
-            description=f"{what[0].upper()}{what[1:]}. It is kept in the run's folder and in MLflow. "
+            description=f"{what[0].upper()}{what[1:]}. This is kept in the run's folder and in MLflow. "
             "A run whose folder is elsewhere is given by MLflow's id.",
         )
-        run = parser.add_argument("run", metavar="RUN", help="as for the other commands")
+        run = parser.add_argument("run", metavar="RUN", help=RUN)
         run.completer = complete_runs  # type: ignore[attr-defined]
         parser.add_argument("values", nargs="+" if name == "tag" else 1, metavar=value)
         if name != "tag":
-            add_overrides(parser, where)
+            add_overrides(parser, STORES_METAVAR)
     delete = add_command(
         actions,
         "delete",
@@ -65,7 +65,7 @@ def add_edits(actions: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
         description="Delete the folders of runs in runs_dir, and mark the runs as deleted in MLflow, after a question. "
         "Runs in progress stay, and so do those that a clone or a registered model needs.",
     )
-    add_run(delete, where, many=True)
+    add_run(delete, STORES_METAVAR, many=True)
     delete.add_argument("--yes", action="store_true", help="do not ask")
 
 

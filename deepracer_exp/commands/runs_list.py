@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from deepracer_exp.errors import BadInput, nearest
 
-from .arguments import STORES, add_command, add_overrides, read_stores
+from .arguments import STORES_METAVAR, add_command, add_overrides, read_stores
 from .output import table_console
 
 if TYPE_CHECKING:
@@ -53,14 +53,22 @@ def add_list(actions: "argparse._SubParsersAction[argparse.ArgumentParser]") -> 
         description="List the runs of a folder or, with tracking.uri=URI, of an MLflow store, newest first.",
         epilog=_EPILOG,
     )
-    add_overrides(listing, " | ".join(f"{key}=..." for key in STORES))
+    add_overrides(listing, STORES_METAVAR)
     listing.add_argument(
-        "--where", action="append", default=[], metavar="CONDITION", help="only runs for which it holds"
+        "--where",
+        action="append",
+        default=[],
+        metavar="CONDITION",
+        help="only runs that meet the condition; of several conditions, all",
     )
-    listing.add_argument("--trials", action="store_true", help="each run of a study, not one line for all")
-    listing.add_argument("--sort", metavar="COLUMN", help="by this column, the smallest first")
-    listing.add_argument("--reverse", action="store_true", help="in the opposite order")
-    listing.add_argument("--format", choices=("table", "json", "csv"), default="table", help="of the output")
+    listing.add_argument(
+        "--trials", action="store_true", help="a line for each run of a study, not one for all of them"
+    )
+    listing.add_argument("--sort", metavar="COLUMN", help="sort by this column, the smallest value first")
+    listing.add_argument("--reverse", action="store_true", help="reverse the order")
+    listing.add_argument(
+        "--format", choices=("table", "json", "csv"), default="table", help="format of the output"
+    )
 
 
 def _list(args: argparse.Namespace) -> int:

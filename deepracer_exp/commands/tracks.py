@@ -47,7 +47,9 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         ),
         epilog=_EPILOG,
     )
-    name = parser.add_argument("name", nargs="?", help="a track of the list, or a route file (.npy, .yaml)")
+    name = parser.add_argument(
+        "name", nargs="?", metavar="TRACK", help="a track of the list, or a route file (.npy, .yaml)"
+    )
     name.completer = _names  # type: ignore[attr-defined]
     add_overrides(parser, "car=NAME | action_space=NAME | KEY=VALUE")
     parser.add_argument(
