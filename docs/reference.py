@@ -101,11 +101,29 @@ def _section(name: str, parser: argparse.ArgumentParser) -> str:
         if action.help not in (None, RUN) and not isinstance(action, argparse._HelpAction)
     ]
     parts.append("\n".join(arguments))
-    paragraphs = (parser.epilog or "").strip("\n").split("\n\n")
-    for is_code, group in groupby(paragraphs, lambda paragraph: "  " in paragraph):  # aligned: examples
-        text = "\n\n".join(group)
-        parts.append(f"```text\n{dedent(text)}\n```" if is_code else text)
+    epilog = re.sub(r"\n\n(?=  )", "\n", parser.epilog or "")
+    for is_indented, group in groupby(epilog.splitlines(), lambda line: line.startswith("  ")):
+        lines = list(group)
+        parts.append(_examples(lines) if is_indented else "\n".join(lines).strip())
     return "\n" + "\n\n".join(filter(None, parts)) + "\n"
+
+
+def _examples(lines: list[str]) -> str:
+    """Return the indented lines of a help text: a list, or examples, each below its explanation as a comment."""
+    if lines[0].startswith("  - "):
+        return dedent("\n".join(lines))
+    examples: list[tuple[str, list[str]]] = []
+    for line in lines:
+        is_explained = re.match(r".{58}  \S", line)  # in column 60; a long example's is on the next line
+        example, explanation = (line[:60].strip(), line[60:]) if is_explained else (line.strip(), "")
+        if example:
+            examples.append((example, []))
+        examples[-1][1].extend(explanation.split())
+    text = ""
+    for example, words in examples:
+        text += fill(" ".join(["#", *words]), 100, subsequent_indent="# ") + "\n" if words else ""
+        text += f"{example}\n"
+    return f"```bash\n{text}```"
 
 
 def _usage(parser: argparse.ArgumentParser) -> str:

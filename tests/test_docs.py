@@ -117,14 +117,9 @@ def test_the_picture_of_the_layers_shows_those_that_are_checked():
 
 
 def _commands():
-    """Return every command that a page shows in a block of code, without its comment; each once.
-
-    The examples of docs/commands.md are the program's own, with explanations that are no comments of a shell.
-    """
+    """Return every command that a page shows in a block of code, without its comment; each once."""
     shown = {}
     for page in PAGES:
-        if page.name == "commands.md":
-            continue
         text = page.read_text(encoding="utf-8").replace("\\\n", "")
         for line in re.findall(r"^(?:    |\$ )?(deepracer-exp .*)$", text, re.MULTILINE):
             words = shlex.split(line, comments=True)
@@ -167,7 +162,9 @@ def test_every_command_shown_is_accepted(words, folder, monkeypatch):
     monkeypatch.setenv("HOME", str(folder))
     monkeypatch.setenv("STUDY_DB", "postgresql+psycopg://racer@host/study")
     words = [re.sub(r"~/deepracer-for-cloud/custom_files", "DIR", word) for word in words]
-    words = [word.replace("track=NAME", "track=Oval_track") for word in words]
+    words = [
+        {"track=NAME": "track=Oval_track", "sweep=NAME": "sweep=season"}.get(word, word) for word in words
+    ]
     args = parse(words)
     if words[0] == "train":
         for overrides in expand_grid(args.overrides) if args.multirun else [args.overrides]:

@@ -30,8 +30,10 @@ _EPILOG = """\
   deepracer-exp runs list --where state=finished --where 'score_s<12' --sort score_s
   deepracer-exp runs list --where user=anna --where tag.car=blue --format csv > season.csv
 
-columns: run name state lap_s score_s exploring_laps exploring_lap_s began user host study trial note id tag.KEY
-conditions: COLUMN=VALUE  COLUMN!=VALUE  COLUMN<NUMBER  <=  >  >=  COLUMN~TEXT (contains it)
+What --where and --sort accept:
+  columns: run name state lap_s score_s exploring_laps exploring_lap_s began user host study trial note id tag.KEY
+  conditions: COLUMN=VALUE  COLUMN!=VALUE  COLUMN<NUMBER  <=  >  >=  COLUMN~TEXT (contains it)
+
 With --where, --sort and the other formats each run of a study has its line, too.
 """
 _CONDITION = re.compile(r"([a-z_]+|tag\.[\w.-]+)\s*(!=|<=|>=|=|<|>|~)\s*(.*)", re.DOTALL)

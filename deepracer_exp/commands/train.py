@@ -51,8 +51,8 @@ An experiment is one option of each group, and any value in it can be set:
                                                             what each group of seeds scored, and what is chance
   deepracer-exp train track=Oval_track --cfg                print the experiment and stop
 
-groups: track race car action_space observation randomization episode reward network algorithm lr_schedule
-        collector evaluation checkpoints stopping budget tracking experiment
+Groups: track race car action_space observation randomization episode reward network algorithm lr_schedule
+collector evaluation checkpoints stopping budget tracking experiment
   deepracer-exp train --options GROUP                       list the options of a group
 """
 
@@ -226,18 +226,18 @@ def _clone(args: argparse.Namespace) -> int:
 
 
 _SWEEP_EPILOG = """\
-a season in one command: rewards, actions and recipes, a second phase, and a page that says what to submit
+A season in one command: rewards, actions and recipes, a second phase, and a page that says what to submit:
   deepracer-exp sweep sweep=season track=Oval_track
 
-what to search, in Hydra's grammar
+What to search, in Hydra's grammar:
   deepracer-exp sweep algorithm.lr='tag(log,interval(1e-5,1e-3))' network=mlp_small,mlp
   deepracer-exp sweep sweep=lr_entropy track=Oval_track     a ready-made study: season, lr_entropy,
                                                             reward_weights, action_space, network, everything,
-                                                            or NAME of ./sweeps/NAME.yaml
+                                                            sac, or NAME of ./sweeps/NAME.yaml
   KEY='interval(LOW,HIGH)'  'tag(log,interval(LOW,HIGH))'  'int(interval(LOW,HIGH))'  A,B  'range(FROM,BELOW,STEP)'
   GROUP='glob(*)'                                           all options of a group
 
-how
+How to search:
   sweep.trials=60 sweep.workers=2 sweep.seeds=3             trials in total, processes, seeds a trial
   sweep.sampler=gp                                          what chooses the next values (docs/sweeps.md)
   sweep.pruners=[entropy,median]                            what ends trials early (docs/sweeps.md); [] prunes nothing
@@ -247,6 +247,7 @@ how
   parent=RUN                                                trials are clones of RUN
   sweep.clone='{randomization: sim2real}'                   the best trial is cloned, and races its clone
 
+To resume, report and use a study:
   deepracer-exp sweep study=NAME                            resumes a study that was interrupted or killed
   deepracer-exp sweep study=NAME sweep.trials=120           makes more trials
   deepracer-exp sweep report NAME [sweep.storage=URL]       writes the study's page and prints where it is
