@@ -229,3 +229,18 @@ def test_every_file_of_ours_that_is_named_exists(page):
         r"`((?:deepracer_exp|sweeps|tests|benchmarks|conf|docs)/[\w/.-]+)`", page.read_text("utf-8")
     )
     assert [name for name in named if not (ROOT / name).exists()] == []
+
+
+def test_reading_the_code_counts_its_files_and_names_functions_that_are_in_them():
+    page = (ROOT / "docs" / "reading_the_code.md").read_text(encoding="utf-8")
+    file = r"`(deepracer_exp/[\w/]+\.py)`"
+    for section in page.split("\n## ")[1:]:
+        counted = set(re.findall(file, section)) - {"deepracer_exp/sweeps/run_sweep.py"}
+        assert f"**{len(counted)} files**" in " ".join(section.split())
+    for path, named in re.findall(rf"{file}((?:(?:,| and)\s+`[\w.]+`)+)", page):
+        text = (ROOT / path).read_text(encoding="utf-8")
+        for name in re.findall(r"`([\w.]+)`", named):
+            for part in name.split("."):
+                assert re.search(rf"^ *(?:(?:class|def) {part}\b|{part} = )", text, re.MULTILINE), (
+                    f"{path}: {name}"
+                )
