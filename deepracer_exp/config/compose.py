@@ -24,7 +24,7 @@ from . import acting
 from .dimension import range_length
 from .evaluation import EvaluateConfig, EvaluationConfig
 from .experiment import Experiment
-from .learning import of_ppo_alone
+from .learning import algorithm_kind, keys_of_others
 from .option_files import change, composed, composed_option, first_line, plain
 from .options import groups, listed, options
 from .overrides import PLAIN_TEXT, override_line, parse_single, parse_sweep
@@ -151,11 +151,12 @@ def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
 
 
 def _leave_out_of_other_algorithm(config: DictConfig, choices: Mapping[str, str]) -> list[str]:
-    """Drop the PPO values of a chosen experiment where SAC is chosen; return a line that names them."""
+    """Drop a chosen experiment's values for another algorithm than the chosen one; return a line that names them."""
     experiment, algorithm = choices.get("experiment"), config.get("algorithm")
-    if experiment is None or algorithm is None or "replay_steps" not in algorithm:
+    if experiment is None or algorithm is None:
         return []
-    unfit = [key for key in of_ppo_alone() if key in algorithm]
+    kind = algorithm_kind(composed_option("algorithm", choices["algorithm"]))
+    unfit = [key for key in keys_of_others(kind) if key in algorithm]
     with open_dict(algorithm):
         for key in unfit:
             del algorithm[key]

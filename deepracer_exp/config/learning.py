@@ -1,5 +1,6 @@
 """Network, algorithm and learning-rate schedule."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, Literal
 
@@ -121,15 +122,27 @@ class SACConfig(AlgorithmConfig):
     tau: Annotated[float, Field(gt=0, le=1)]
 
 
-def of_ppo_alone() -> list[str]:
-    """Return the keys that PPO has and SAC does not."""
-    ours = {key.name for key in fields(SACConfig)}
-    return [key.name for key in fields(PPOConfig) if key.name not in ours]
+ALGORITHMS: tuple[type[AlgorithmConfig], ...] = (PPOConfig, SACConfig)
+
+
+def algorithm_kind(values: Mapping[str, Any]) -> type[AlgorithmConfig]:
+    """Return the class of an algorithm's values: the one whose keys differ least from theirs."""
+    return min(ALGORITHMS, key=lambda kind: len(_keys(kind) ^ values.keys()))
+
+
+def keys_of_others(kind: type[AlgorithmConfig]) -> list[str]:
+    """Return the keys that other algorithms have and this one does not."""
+    others = (key.name for other in ALGORITHMS for key in fields(other))
+    return [key for key in dict.fromkeys(others) if key not in _keys(kind)]
+
+
+def _keys(kind: type[AlgorithmConfig]) -> set[str]:
+    return {key.name for key in fields(kind)}
 
 
 OneAlgorithm = Annotated[
-    Annotated[PPOConfig, Tag("ppo")] | Annotated[SACConfig, Tag("sac")],
-    Discriminator(lambda value: "sac" if isinstance(value, dict) and "replay_steps" in value else "ppo"),
+    Annotated[PPOConfig, Tag("PPOConfig")] | Annotated[SACConfig, Tag("SACConfig")],
+    Discriminator(lambda value: algorithm_kind(value if isinstance(value, dict) else {}).__name__),
 ]
 """Configuration of any algorithm, recognised by its keys."""
 

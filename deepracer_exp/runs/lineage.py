@@ -9,7 +9,6 @@ from typing import Annotated, Any, TypeVar
 from pydantic import Field, TypeAdapter
 
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.config.learning import PPOConfig
 from deepracer_exp.config.stored import ABSENT, config_differences, describe_differences
 from deepracer_exp.env.action_space import build_action_space, describe_actions
 from deepracer_exp.errors import BadInput
@@ -68,18 +67,15 @@ def refuse_other_networks(parent: Experiment, clone: Experiment) -> None:
             describe_differences(config_differences([vars(parent.network), vars(clone.network)]))
         )
         raise BadInput("network", f"cannot be changed in a clone: {changed}; {why}")
-    kinds = [
-        "PPO" if isinstance(algorithm, PPOConfig) else "SAC"
-        for algorithm in (parent.algorithm, clone.algorithm)
-    ]
-    if kinds[0] != kinds[1]:
-        raise BadInput("algorithm", f"cannot be changed in a clone: {kinds[0]} -> {kinds[1]}; {why}")
-    before, after = (
+    before, after = (type(run.algorithm).__name__.removesuffix("Config") for run in (parent, clone))
+    if before != after:
+        raise BadInput("algorithm", f"cannot be changed in a clone: {before} -> {after}; {why}")
+    seen_before, seen_after = (
         {name: sensor and vars(sensor) for name, sensor in (("camera", seen.camera), ("lidar", seen.lidar))}
         for seen in (parent.observation, clone.observation)
     )
-    if before != after:
-        changed = "; ".join(describe_differences(config_differences([before, after])))
+    if seen_before != seen_after:
+        changed = "; ".join(describe_differences(config_differences([seen_before, seen_after])))
         raise BadInput("observation", f"cannot be changed in a clone: {changed}; {why}")
     if clone.observation != parent.observation:
         from deepracer_exp.env.observation import feature_names  # imports MuJoCo

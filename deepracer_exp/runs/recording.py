@@ -28,6 +28,7 @@ from deepracer_exp.aws.logs.recorded import (
 from deepracer_exp.aws.models.model_metadata import ModelMetadata
 from deepracer_exp.config.custom_files.model_files import SAC_TAKEN, TAKEN
 from deepracer_exp.config.driving import OFF, ActionSpaceConfig
+from deepracer_exp.config.learning import SACConfig, algorithm_kind
 from deepracer_exp.config.racing import RaceConfig
 from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.env.others.placement import PlacedOthers, read_placements
@@ -402,7 +403,7 @@ def _hyperparameters(config: Mapping[str, Any]) -> dict[str, Any] | None:
     algorithm = config.get("algorithm")
     if not isinstance(algorithm, Mapping):
         return None
-    taken = SAC_TAKEN if "replay_steps" in algorithm else TAKEN
+    taken = SAC_TAKEN if algorithm_kind(algorithm) is SACConfig else TAKEN
     keys = {word: key.removeprefix("algorithm.") for word, key in taken.items()}
     return {word: algorithm[key] for word, key in keys.items() if algorithm.get(key) is not None}
 
