@@ -41,9 +41,9 @@ from typing import Any
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.stopping import StoppingConfig
 from deepracer_exp.env.action_space import build_action_space
+from deepracer_exp.evaluation.results import NOT_EVALUATED
 from deepracer_exp.runs.checkpoints import checkpoint_name, read_training
 from deepracer_exp.runs.stored_run import StoredRun
-from deepracer_exp.training.metrics import NOT_EVALUATED
 from deepracer_exp.training.stopping.stopping_rules import Decision, build_rule
 
 from .command import at_once, read_metrics, read_summary, trained

@@ -5,9 +5,9 @@ from typing import Any
 
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.setup import RaceSetup
-from deepracer_exp.evaluation.results import Evaluation, Rank
+from deepracer_exp.evaluation.results import NOT_EVALUATED, Evaluation, Rank, eval_columns
 
-from .metrics import NOT_EVALUATED, Finished, Ranking, eval_columns
+from .metrics import Finished, Ranking
 
 _DRIVING = "driving"
 """The measure of a policy that is not evaluated: the training's own episodes."""

@@ -11,6 +11,7 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.evaluation.results import AMONG_OTHERS, NOT_EVALUATED, eval_columns
 from deepracer_exp.runs.run_result import Ending
 from deepracer_exp.runs.stored_run import StoredRun
 from deepracer_exp.tracking.delivery import ENDS
@@ -22,7 +23,6 @@ from deepracer_exp.training.stopping.stopping_rules import Decision, StoppingRul
 from .budget import Alerts
 from .display import ProgressDisplay, RunHeader
 from .machine import machine_use
-from .metrics import AMONG_OTHERS, NOT_EVALUATED, eval_columns
 from .train_result import TrainResult
 from .trainer import Callback, Trainer
 

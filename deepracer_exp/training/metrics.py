@@ -11,7 +11,6 @@ from deepracer_exp.config.stopping import ReliableStopping, StoppingConfig
 from deepracer_exp.env.rules import lap_clock_s
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.env.trace_columns import PACKED, STATUS_CODE
-from deepracer_exp.evaluation.results import HELD_OUT, USUAL, Evaluation, zigzag_columns
 from deepracer_exp.runs.fingerprint import REMEMBERED_EPISODES
 from deepracer_exp.tracking.mlflow_metrics import track_labels, track_metric
 
@@ -278,38 +277,3 @@ class Ranking:
         """Take over a `state_dict`."""
         self._completion, self._speed_mps = state["completion"].copy(), state["speed_mps"].copy()
         self._episodes = state["episodes"].copy()
-
-
-EVAL_COLUMNS = (
-    "eval_completion",
-    "held_out_completion",
-    "eval_lap_share",
-    "eval_laps",
-    "eval_laps_tried",
-    "eval_lap_time_s",
-    "eval_race_score_s",
-    "eval_zigzag_per_m",
-    "eval_zigzag_deg",
-    "eval_zigzag_lost_s",
-)
-NOT_EVALUATED: dict[str, float | None] = dict.fromkeys(EVAL_COLUMNS)
-AMONG_OTHERS = ("eval_crash_free", "eval_won")
-"""Further columns of an evaluation among boxes or bots, or against a rival, in rows with an evaluation only."""
-
-
-def eval_columns(evaluation: Evaluation) -> dict[str, float | None]:
-    """Return the columns of an evaluation in metrics.jsonl: `EVAL_COLUMNS`, and those of `AMONG_OTHERS` that apply."""
-    usual = evaluation.on(USUAL)
-    held_out = evaluation.on(HELD_OUT) if HELD_OUT in evaluation.conditions else None
-    return {
-        "eval_completion": usual.completion,
-        "held_out_completion": None if held_out is None else held_out.completion,
-        "eval_lap_share": usual.lap_share,
-        "eval_laps": len(usual.lap_times_s),
-        "eval_laps_tried": len(usual.decided),
-        "eval_lap_time_s": usual.mean_lap_time_s,
-        "eval_race_score_s": evaluation.race_score_s,
-        **zigzag_columns(usual),
-        **({"eval_crash_free": usual.crash_free_share} if evaluation.among_others else {}),
-        **({"eval_won": usual.won_share} if usual.won else {}),
-    }

@@ -25,7 +25,7 @@ from deepracer_exp.env.others.placement import placements_table
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.env.trace_columns import PACKED, to_table
 from deepracer_exp.errors import RunFailed, reading
-from deepracer_exp.evaluation.results import Evaluation
+from deepracer_exp.evaluation.results import NOT_EVALUATED, Evaluation
 from deepracer_exp.evaluation.rival_run import kept_rival
 from deepracer_exp.runs.checkpoints import CheckpointStore, read_agent
 from deepracer_exp.runs.fingerprint import fingerprint
@@ -37,7 +37,7 @@ from deepracer_exp.sim.batch import cores
 
 from .best_policy import BestPolicy
 from .budget import Budget
-from .metrics import NOT_EVALUATED, Finished, RunMetrics, track_names
+from .metrics import Finished, RunMetrics, track_names
 from .rival_pool import RivalPool
 from .signals import Interruption
 from .train_result import TrainResult

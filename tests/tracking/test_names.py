@@ -9,6 +9,7 @@ from mlflow.utils.validation import _validate_metric_name
 from deepracer_exp.agents.sac import SACMetrics
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.options import options
+from deepracer_exp.evaluation.results import EVAL_COLUMNS
 from deepracer_exp.tracking.metadata import (
     LONGEST_PARAM,
     flatten,
@@ -26,7 +27,6 @@ from deepracer_exp.tracking.mlflow_metrics import (
     track_labels,
     track_metric,
 )
-from deepracer_exp.training.metrics import EVAL_COLUMNS
 
 awkward = st.text(st.sampled_from("aAb_-.2/ :ß"), max_size=6)
 
