@@ -21,6 +21,9 @@ export SSL_CERT_FILE ?= $(PIP_CERT)
 endif
 # Compiled once here and not by every process: importing PyTorch and MLflow from sources takes three times as long.
 INSTALL = $(BIN)/uv pip install --compile-bytecode --python $(BIN)/python --constraint constraints.txt
+# Numba compiles the cars in the first process that drives: half a minute on one core.
+WARM = runs=$$(mktemp -d) && { $(BIN)/deepracer-exp train experiment=tiny tracking=off runs_dir=$$runs >$$runs/log 2>&1 || \
+	{ cat $$runs/log; exit 1; }; } && rm -r $$runs
 
 .DEFAULT_GOAL := help
 .PHONY: help env race test test-long test-faults check extras bench docs clean
@@ -35,6 +38,8 @@ $(RACER): pyproject.toml constraints.txt
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt uv
 	@echo "installing deepracer_exp and what it needs to race, in the versions of constraints.txt"
 	@$(INSTALL) --editable .
+	@echo "compiling the cars once, for the first training and the tests"
+	@$(WARM)
 	@touch $@
 
 $(STAMP): $(RACER)
