@@ -78,7 +78,7 @@ def test_help_names_every_command(call):
 
 def test_help_of_train_names_every_group(call):
     text = call("train", "--help").stdout
-    listed = text[text.index("groups:") :].split()
+    listed = text[text.index("Groups:") :].split()
     assert set(groups()) <= set(listed)
 
 
