@@ -142,7 +142,7 @@ def _keys(kind: type[AlgorithmConfig]) -> set[str]:
 
 OneAlgorithm = Annotated[
     Annotated[PPOConfig, Tag("PPOConfig")] | Annotated[SACConfig, Tag("SACConfig")],
-    Discriminator(lambda value: algorithm_kind(value if isinstance(value, dict) else {}).__name__),
+    Discriminator(lambda value: (algorithm_kind(value) if isinstance(value, dict) else PPOConfig).__name__),
 ]
 """Configuration of any algorithm, recognised by its keys."""
 
