@@ -7,29 +7,44 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from deepracer_exp.collectors import car_worker
+from deepracer_exp.sweeps.queue import worker
 
-def test_the_fork_server_has_loaded_the_compiled_functions_of_its_workers():
-    code = """
-import gc, json
-import deepracer_exp.collectors.car_worker
-import deepracer_exp.collectors.fork_ready
-from deepracer_exp.tracks import segments
-print(json.dumps([bool(segments._candidates.signatures), gc.get_freeze_count()]))
+# Run in a process that forks workers: prints what one of them has imported before it is told anything.
+FORKED = """
+import multiprocessing
+code = "import gc, json, sys; print(json.dumps([*sys.modules, gc.get_freeze_count()]))"
+multiprocessing.Process(target=exec, args=(code,)).start()
 """
+
+
+def forked(done: subprocess.CompletedProcess[str]) -> tuple[set[str], int]:
+    """Return the modules of a worker and how many objects are left out of its garbage collection."""
+    *names, frozen = json.loads(done.stdout.splitlines()[-1])
+    return set(names), frozen
+
+
+# The server ignores a name that is none, and each worker would import for seconds while the training waits.
+def test_workers_are_forked_from_a_process_that_has_imported_and_compiled_what_they_need():
+    code = f"""
+from deepracer_exp.collectors.forking import start_workers_early
+start_workers_early(True)
+{FORKED}"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    has_compiled, frozen = json.loads(done.stdout.splitlines()[-1])
-    assert has_compiled
+    names, frozen = forked(done)
+    assert {car_worker.__name__, "deepracer_exp.collectors.fork_ready", "torchrl"} <= names
     assert frozen > 0
 
 
 def test_a_sweep_starts_its_workers_before_it_imports_pytorch_or_pandas(tmp_path):
-    code = """
+    code = f"""
 import sys
 from deepracer_exp.cli import main
 from deepracer_exp.sweeps import run_sweep
 
 def run(driver, interruption):
-    print({"torch", "pandas"} & sys.modules.keys())
+    print({{"torch", "pandas"}} & sys.modules.keys(), flush=True)
+    exec({FORKED!r})
     return 130
 
 run_sweep.Driver.run = run
@@ -40,6 +55,8 @@ main(["sweep", "experiment=tiny", "algorithm.lr=1e-3,1e-4", "tracking=off"])
     )
     assert done.returncode == 130, done.stderr
     assert done.stdout.splitlines()[0] == "set()"
+    names, _ = forked(done)
+    assert {worker.__name__, "torchrl"} <= names
 
 
 def state_of_libraries(modules: Sequence[str], compared: Sequence[str] = ()) -> tuple[dict, dict]:

@@ -23,7 +23,7 @@ def start_workers_early(wanted: bool, *modules: str) -> None:
 
     multiprocessing.set_start_method("forkserver", force=True)
     package = "deepracer_exp.collectors"
-    needed = modules or (f"{package}.worker",)
+    needed = modules or (f"{package}.car_worker",)
     multiprocessing.set_forkserver_preload(
         [f"{package}.fork_server", *needed, _PROGRAM, f"{package}.fork_ready"]
     )
