@@ -4,6 +4,7 @@ import atexit
 import contextlib
 import functools
 import gc
+import hashlib
 import io
 import json
 import os
@@ -21,6 +22,7 @@ from typing import Any
 
 import psutil
 import pytest
+from filelock import FileLock
 from hypothesis import settings
 
 from deepracer_exp.cli import main
@@ -334,11 +336,23 @@ def train_here(call: Callable[..., Ended]) -> Callable[..., Ended]:
 
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Ended]:
-    """Train the tiny experiment in this process, in a folder of its own; once for each set of overrides."""
+    """Train the tiny experiment in this process, once for each set of overrides and for both processes of tests.
+
+    Nothing may be changed in its folder: see `copied`.
+    """
+    own = tmp_path_factory.getbasetemp()
+    shared = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "trained"
 
     @functools.cache
     def train(*overrides: str) -> Ended:
-        return call_in(tmp_path_factory.mktemp("trained"), "train", *IN_PROCESS, *overrides)
+        folder = shared / hashlib.sha256("\0".join(overrides).encode()).hexdigest()[:16]
+        folder.mkdir(parents=True, exist_ok=True)
+        said = folder / "ended.json"
+        with FileLock(folder / "lock"):
+            if not said.exists():
+                ended = call_in(folder, "train", *IN_PROCESS, *overrides)
+                said.write_text(json.dumps([ended.code, ended.stdout, ended.stderr]), encoding="utf-8")
+        return Ended(*json.loads(said.read_text(encoding="utf-8")), folder)
 
     return train
 
