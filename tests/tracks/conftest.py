@@ -1,17 +1,17 @@
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
-from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.compose import compose_option
 from deepracer_exp.config.driving import TrackConfig
 from deepracer_exp.tracks.track import Track
 
 
-@cache
-def compose_track(name: str, *overrides: str) -> TrackConfig:
-    return compose_experiment([f"track={name}", *overrides])[0].track
+def compose_track(name: str, **changed: object) -> TrackConfig:
+    return replace(compose_option("track", name, TrackConfig), **changed)
 
 
 @pytest.fixture(scope="session")
@@ -21,7 +21,9 @@ def track_config() -> Callable[..., TrackConfig]:
 
 @pytest.fixture(scope="session")
 def catalogue_track() -> Callable[..., Track]:
-    return cache(lambda name, *overrides: Track.from_config(compose_track(name, *overrides)))
+    return cache(
+        lambda name, direction="forward": Track.from_config(compose_track(name, direction=direction))
+    )
 
 
 @pytest.fixture

@@ -31,7 +31,7 @@ def test_a_course_has_the_published_length_width_and_order(catalogue_track, name
 
 @pytest.mark.parametrize("name", ["reinvent_base", "Straight_track"])
 def test_a_route_file_takes_the_place_of_the_world(track_config, reference, name):
-    config = track_config("Monaco", f"track.file='{reference}/routes/{name}.npy'")
+    config = track_config("Monaco", file=f"{reference}/routes/{name}.npy")
     track = Track.from_config(config)
     length_m, width_m, order = PUBLISHED[name]
     assert (track.name, track.title) == (name, name)
@@ -43,7 +43,7 @@ def test_a_route_file_takes_the_place_of_the_world(track_config, reference, name
 def test_a_file_of_knots_names_its_course(track_config, tmp_path):
     path = tmp_path / "Über den Hof.yaml"
     path.write_text("title: Hof\nwidth_m: 0.8\nknots: [[0, 0], [4, 0], [4, 3], [0, 3]]\n", encoding="utf-8")
-    track = Track.from_config(track_config("Monaco", f"track.file='{path}'"))
+    track = Track.from_config(track_config("Monaco", file=str(path)))
     assert (track.name, track.title, track.closed, track.width_m) == (
         "Über den Hof",
         "Hof",
@@ -70,7 +70,7 @@ def test_a_file_that_makes_no_course_gives_one_line_that_names_it(
     path = tmp_path / name
     if content is not None:
         path.write_text(content)
-    config = track_config("Monaco", f"track.file='{path}'")
+    config = track_config("Monaco", file=str(path))
     said = refused(Track.from_config, config)
     assert complaint in said
     assert str(path) in said

@@ -19,10 +19,10 @@ def test_the_arrow_turns_with_the_direction(catalogue_track):
         return set(draw_terminal(catalogue_track(*course), 60, 16)) & set(ARROWS)
 
     assert arrow("reinvent_base") == {"→"}
-    assert arrow("reinvent_base", "track.direction=reversed") == {"←"}
+    assert arrow("reinvent_base", "reversed") == {"←"}
 
 
-@pytest.mark.parametrize("course", [("Spain_track",), ("Straight_track", "track.direction=reversed")])
+@pytest.mark.parametrize("course", [("Spain_track",), ("Straight_track", "reversed")])
 def test_a_picture_shows_the_colours_of_the_floor(catalogue_track, tmp_path, course):
     track = catalogue_track(*course)
     draw_picture(track, tmp_path / "course.png")

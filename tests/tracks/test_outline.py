@@ -5,9 +5,7 @@ import shapely
 from deepracer_exp.tracks.outline import Outline, draw_track, extent
 
 
-@pytest.mark.parametrize(
-    "course", [("reinvent_base",), ("Spain_track", "track.direction=reversed"), ("Straight_track",)]
-)
+@pytest.mark.parametrize("course", [("reinvent_base",), ("Spain_track", "reversed"), ("Straight_track",)])
 def test_the_road_that_is_drawn_is_the_road_that_the_rules_know(catalogue_track, course):
     track = catalogue_track(*course)
     outline = Outline.of(track)

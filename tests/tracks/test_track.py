@@ -13,11 +13,10 @@ from deepracer_exp.tracks.track import Track
 
 COURSES = [
     ("reinvent_base",),
-    ("reinvent_base", "track.direction=reversed"),
     ("Spain_track",),
-    ("Tokyo_Training_track", "track.direction=reversed"),
+    ("Tokyo_Training_track", "reversed"),
     ("Straight_track",),
-    ("Straight_track", "track.direction=reversed"),
+    ("Straight_track", "reversed"),
 ]
 
 
@@ -26,10 +25,12 @@ def track(request, catalogue_track) -> Track:
     return catalogue_track(*request.param)
 
 
-@pytest.fixture(params=[0.3, 5.0], ids=["inside the grid", "beyond the grid"])
-def points(request, track) -> np.ndarray:
-    low, high = track.outer.min(axis=0) - request.param, track.outer.max(axis=0) + request.param
-    return np.random.default_rng(1).uniform(low, high, (3000, 2))
+@pytest.fixture
+def points(track) -> np.ndarray:
+    """Return points inside the grid of segments, and beyond it."""
+    draw = np.random.default_rng(1)
+    low, high = track.outer.min(axis=0), track.outer.max(axis=0)
+    return np.concatenate([draw.uniform(low - beyond, high + beyond, (1500, 2)) for beyond in (0.3, 5.0)])
 
 
 def as_line(points: np.ndarray, closed: bool) -> shapely.Geometry:
@@ -109,7 +110,7 @@ def test_the_road_is_the_outer_polygon_without_the_inner_one(track, points):
 
 def test_a_reversed_course_mirrors_the_positions_and_swaps_the_sides(catalogue_track):
     forward = catalogue_track("Spain_track")
-    backward = catalogue_track("Spain_track", "track.direction=reversed")
+    backward = catalogue_track("Spain_track", "reversed")
     points = forward.waypoints[5:-5] + 0.07
     there, back = forward.project(points), backward.project(points)
     np.testing.assert_allclose(back.ndist, 1 - there.ndist, atol=1e-12)

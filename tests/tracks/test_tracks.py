@@ -9,7 +9,7 @@ NAMES = ("Spain_track", "reinvent_base", "Straight_track", "2022_summit_speedway
 @pytest.fixture(scope="module")
 def several(catalogue_track) -> list[Track]:
     tracks = [catalogue_track(name) for name in NAMES]
-    return [*tracks, catalogue_track("Oval_track", "track.direction=reversed")]
+    return [*tracks, catalogue_track("Oval_track", "reversed")]
 
 
 @pytest.fixture(scope="module")
