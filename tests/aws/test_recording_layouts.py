@@ -2,6 +2,7 @@
 
 import json
 import os
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -24,14 +25,25 @@ LAYOUTS = {
 EXACT = ("X", "Y", "yaw", "steer", "throttle", "reward", "progress", "track_len", "tstamp")
 
 
+def written(files: dict[str, str], folder: Path, kind: str) -> Path:
+    if kind == "folder":
+        return made.write_folder(files, folder / "model")
+    return made.write_archive(files, folder / "model.tar.gz")
+
+
 @pytest.fixture(params=["folder", "archive"])
 def place(request, tmp_path):
-    def write(files: dict[str, str]) -> Path:
-        if request.param == "folder":
-            return made.write_folder(files, tmp_path / "model")
-        return made.write_archive(files, tmp_path / "model.tar.gz")
+    return lambda files: written(files, tmp_path, request.param)
 
-    return write
+
+@pytest.fixture(scope="module", params=["folder", "archive"])
+def recording_of(request, tmp_path_factory):
+    """Return what is read of a layout, read once for all tests."""
+    return cache(
+        lambda layout: read_recording(
+            written(LAYOUTS[layout](), tmp_path_factory.mktemp(layout), request.param)
+        )
+    )
 
 
 def check_table(table: pd.DataFrame, columns) -> None:
@@ -40,8 +52,8 @@ def check_table(table: pd.DataFrame, columns) -> None:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_every_layout_gives_the_same_table_with_every_row_once(place, layout):
-    recording = read_recording(place(LAYOUTS[layout]()))
+def test_every_layout_gives_the_same_table_with_every_row_once(recording_of, layout):
+    recording = recording_of(layout)
     check_table(recording.steps, STEP_COLUMNS)
     check_table(recording.updates, UPDATE_COLUMNS)
     check_table(recording.metrics, METRICS_COLUMNS)
@@ -54,8 +66,8 @@ def test_every_layout_gives_the_same_table_with_every_row_once(place, layout):
 
 
 @pytest.mark.parametrize("layout", ["drfc_single", "console", "droa"])
-def test_the_rows_are_those_that_were_driven_with_all_digits(place, layout):
-    rows, wanted = made.training(read_recording(place(LAYOUTS[layout]()))), made.whole_training()
+def test_the_rows_are_those_that_were_driven_with_all_digits(recording_of, layout):
+    rows, wanted = made.training(recording_of(layout)), made.whole_training()
     for name in (*EXACT, "episode", "steps", "done", "all_wheels_on_track", "closest_waypoint", "action"):
         np.testing.assert_array_equal(rows[name], wanted[name])
     np.testing.assert_array_equal(rows["episode_status"].astype(str), wanted["episode_status"])
@@ -63,8 +75,8 @@ def test_the_rows_are_those_that_were_driven_with_all_digits(place, layout):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_settings_are_found_in_every_layout_that_has_them(place, layout):
-    recording = read_recording(place(LAYOUTS[layout]()))
+def test_settings_are_found_in_every_layout_that_has_them(recording_of, layout):
+    recording = recording_of(layout)
     assert recording.hyperparameters == made.HYPERPARAMETERS
     assert [tuple(action) for action in recording.metadata.actions] == [(-20.0, 1.0), (20.0, 2.0)]
     if layout != "droa":
@@ -88,16 +100,16 @@ def test_a_hyperparameter_that_is_not_accepted_is_listed_and_the_others_are_kept
 
 
 @pytest.mark.parametrize("layout", ["console", "droa"])
-def test_policy_updates_stand_with_their_iterations(place, layout):
-    updates = read_recording(place(LAYOUTS[layout]())).updates
+def test_policy_updates_stand_with_their_iterations(recording_of, layout):
+    updates = recording_of(layout).updates
     assert updates[["iteration", "epoch"]].to_numpy().tolist() == [[i, e] for i in range(3) for e in range(2)]
     assert updates["entropy"].tolist() == [2.0, 2.0, 1.9, 1.9, 1.8, 1.8]
     assert updates["kl"].isna().all()
 
 
 @pytest.mark.parametrize("layout", ["drfc_single", "drfc_workers", "console", "droa"])
-def test_metrics_report_the_episodes_of_the_trace(place, layout):
-    recording = read_recording(place(LAYOUTS[layout]()))
+def test_metrics_report_the_episodes_of_the_trace(recording_of, layout):
+    recording = recording_of(layout)
     logged = recording.metrics[recording.metrics["stream"] == "training"].set_index("episode")
     driven = made.training(recording).groupby("episode")
     assert sorted(logged.index) == sorted(driven.groups)
@@ -110,8 +122,8 @@ def test_metrics_report_the_episodes_of_the_trace(place, layout):
         assert (evaluated["phase"], evaluated["episode"], evaluated["resets"]) == ("evaluation", 0, 1)
 
 
-def test_episodes_of_several_workers_are_numbered_by_iteration_and_worker(place):
-    rows = made.training(read_recording(place(made.drfc_workers())))
+def test_episodes_of_several_workers_are_numbered_by_iteration_and_worker(recording_of):
+    rows = made.training(recording_of("drfc_workers"))
     of = rows.groupby("episode")[["iteration", "worker"]].first()
     assert of.to_numpy().tolist() == [[i, w] for i in range(3) for w in (0, 0, 1, 1)]
     assert rows["iteration"].is_monotonic_increasing

@@ -39,8 +39,9 @@ def read_or_refused(path: Path) -> Recording | None:
     return None
 
 
-@pytest.mark.parametrize("prefix", PREFIXES)
-@pytest.mark.parametrize("fields", GENERATIONS)
+@pytest.mark.parametrize(
+    ("fields", "prefix"), [*zip(GENERATIONS, PREFIXES, strict=True), (19, ""), (15, PREFIXES[-1])]
+)
 def test_every_generation_of_lines_with_any_prefix_has_the_same_columns(tmp_path, fields, prefix):
     suffix = '\\n","stream":"stdout"}' if prefix.startswith("{") else "\r" if prefix else "\tmore"
     log = tmp_path / "a-robomaker.log"
@@ -92,7 +93,7 @@ def test_the_radians_of_2019_become_degrees_and_later_degrees_stay(tmp_path):
 
 @pytest.mark.parametrize(
     "action",
-    ["[-6.65667057  0.65535903]", "[ 5.  1.]", "[1.5875086159594005 1.7339787686700332]", "[-30.0, 1.21]"],
+    ["[-6.65667057  0.65535903]", "[ 5.  1.]", "[-30.0, 1.21]"],
 )
 def test_a_continuous_action_is_no_number(tmp_path, action):
     rows = ROWS.assign(action=action)
@@ -135,7 +136,7 @@ def test_a_file_whose_first_rows_cannot_be_read_is_given_up_early_and_the_first_
         monkeypatch.setattr(module, "read_rows", counted)
     header, row = made.csv_text(ROWS).splitlines()[:2]
     bad = f"{row},more,evenmore,most"
-    lines = [header, *[bad] * 200_000] if name.endswith(".csv") else [f"SIM_TRACE_LOG:{bad}"] * 200_000
+    lines = [header, *[bad] * 20_000] if name.endswith(".csv") else [f"SIM_TRACE_LOG:{bad}"] * 20_000
     (tmp_path / name).write_text("\n".join(lines))
     first = 2 if name.endswith(".csv") else 1
     assert f"{name}:{first}: 20 values; accepted: " in refused(read_recording, tmp_path / name)
@@ -281,9 +282,9 @@ def test_a_large_log_with_few_trace_lines_takes_little_memory(tmp_path):
         * 11_000
     )
     with log.open("wb") as file:
-        for number in range(150):  # 150 MB
+        for number in range(90):  # 90 MB
             file.write(noise)
-            if number % 50 == 0:
+            if number % 30 == 0:
                 file.write(made.log_text(ROWS.assign(episode=ROWS["episode"] + number)).encode())
     tracemalloc.start()
     recording = read_recording(log)
@@ -325,15 +326,13 @@ def damaged(text: str, changes: list[tuple[float, str, str]]) -> str:
     return text
 
 
-@pytest.mark.parametrize("name", ["a.log", "0-iteration.csv"])
-@given(fields=st.sampled_from(GENERATIONS), changes=edits, cut=st.floats(0.1, 1))
+@given(is_csv=st.booleans(), fields=st.sampled_from(GENERATIONS), changes=edits, cut=st.floats(0.1, 1))
 @examples(150)
-def test_every_line_of_a_trace_is_read_or_listed(tmp_path_factory, name, fields, changes, cut):
-    is_csv = name.endswith(".csv")
+def test_every_line_of_a_trace_is_read_or_listed(tmp_path_factory, is_csv, fields, changes, cut):
     head, _, body = made.csv_text(ROWS, fields).partition("\n")
     body = damaged(body if is_csv else made.log_text(ROWS, fields), changes)
     body = body[: int(cut * len(body))]
-    file = tmp_path_factory.mktemp("fuzz") / name
+    file = tmp_path_factory.mktemp("fuzz") / ("0-iteration.csv" if is_csv else "a.log")
     file.write_text(f"{head}\n{body}" if is_csv else body, newline="")
     present = sum(bool(line.strip()) if is_csv else "SIM_TRACE_LOG:" in line for line in body.split("\n"))
     recording = read_or_refused(file)
@@ -341,14 +340,13 @@ def test_every_line_of_a_trace_is_read_or_listed(tmp_path_factory, name, fields,
         assert len(recording.steps) + sum(problem.lines for problem in recording.problems) == present
 
 
-@given(raw=st.binary(max_size=2000), name=st.sampled_from(FILES))
+@given(raw=st.binary(max_size=2000), name=st.sampled_from(FILES), is_folder=st.booleans())
 @examples(150)
-def test_random_bytes_are_read_or_refused_in_one_line(tmp_path_factory, raw, name):
+def test_random_bytes_are_refused_in_one_line(tmp_path_factory, raw, name, is_folder):
     folder = tmp_path_factory.mktemp("fuzz")
     head = b"\x1f\x8b\x08\0" if name.endswith("gz") else b""
     (folder / name).write_bytes(head + raw)
-    for path in (folder, folder / name):
-        refused(read_recording, path)
+    refused(read_recording, folder if is_folder else folder / name)
 
 
 @given(cut=st.floats(0, 1), changes=edits)
