@@ -1,5 +1,6 @@
 import ast
 import contextlib
+import re
 import subprocess
 import sys
 import zipfile
@@ -198,23 +199,24 @@ UNPICKLERS = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "m
 DANGEROUS = {"torch.load", "pickle.load", "pickle.loads", "yaml.load", "os.system"}
 
 
-@pytest.mark.parametrize(
-    "path",
-    sorted(Path(deepracer_exp.__file__).parent.rglob("*.py")),
-    ids=lambda path: f"{path.parent.name}/{path.name}",
-)
-def test_nothing_in_the_package_unpickles_and_only_rewards_are_executed(path):
-    text = path.read_text(encoding="utf-8")
-    nodes = list(ast.walk(ast.parse(text)))
-    calls = {ast.unparse(node.func) for node in nodes if isinstance(node, ast.Call)}
-    imports = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
-    imports |= {node.module for node in nodes if isinstance(node, ast.ImportFrom)}
-    assert not imports & UNPICKLERS
-    assert not calls & DANGEROUS
-    for words in ("weights_only=False", "allow_pickle=True", "shell=True"):
-        assert words not in text
-    if path.name != "time_limit.py":  # `run_module`, for reward functions
-        assert not calls & {"eval", "exec"}
+def test_nothing_in_the_package_unpickles_and_only_rewards_are_executed():
+    paths = sorted(Path(deepracer_exp.__file__).parent.rglob("*.py"))
+    assert len(paths) > 300
+    words = "|".join([*UNPICKLERS, *map(re.escape, DANGEROUS), "eval", "exec"])
+    for path in paths:
+        text = path.read_text(encoding="utf-8")
+        for argument in ("weights_only=False", "allow_pickle=True", "shell=True"):
+            assert argument not in text, path
+        if not re.search(rf"\b({words})\b", text):  # parsing them all takes a second
+            continue
+        nodes = list(ast.walk(ast.parse(text)))
+        calls = {ast.unparse(node.func) for node in nodes if isinstance(node, ast.Call)}
+        imports = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+        imports |= {node.module for node in nodes if isinstance(node, ast.ImportFrom)}
+        assert not imports & UNPICKLERS, path
+        assert not calls & DANGEROUS, path
+        if path.name != "time_limit.py":  # `run_module`, for reward functions
+            assert not calls & {"eval", "exec"}, path
 
 
 def test_a_save_on_a_full_disk_raises_and_leaves_the_previous_checkpoint_whole(mounted):
