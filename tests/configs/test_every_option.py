@@ -10,6 +10,7 @@ import yaml
 from deepracer_exp.agents.actor_critic import build_actor_critic
 from deepracer_exp.agents.schedules import PresetSchedule
 from deepracer_exp.config.compose import Composition, compose_experiment
+from deepracer_exp.config.driving import RewardConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.options import conf_dir, groups, options
 from deepracer_exp.env.observation import observation_shape
@@ -171,4 +172,5 @@ def test_every_reward_of_the_zoo_has_an_option_of_its_name():
     zoo = {path.stem for path in (Path(conf_dir()).parent / "reward_zoo").glob("[!_]*.py")}
     assert set(options("reward")) == zoo
     for name in zoo:
-        assert with_option("reward", name).reward.name == name
+        plain = RewardConfig(name=name, file=None, constants={}, time_limit_s=5.0)
+        assert with_option("reward", name).reward == plain
