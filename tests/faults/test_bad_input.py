@@ -3,6 +3,7 @@
 import json
 import pickle
 import resource
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -38,14 +39,16 @@ def test_values_that_cannot_be_used_are_refused_in_one_line(train_here, override
 
 
 def test_cars_that_do_not_fit_into_memory_are_refused_in_one_line(train_here):
+    import_module("deepracer_exp.training.run")  # its libraries need memory, too
+    # A column of the batch is larger than what is left, so that little is filled before the refusal.
+    overrides = "collector.cars=100", "algorithm.frames_per_iteration=10000000"
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (psutil.Process().memory_info().vms + 2**30, hard))
+    resource.setrlimit(resource.RLIMIT_AS, (psutil.Process().memory_info().vms + 2**28, hard))
     try:
-        refused = train_here("collector.cars=100", "algorithm.frames_per_iteration=10000000")
+        refused = train_here(*overrides)
     finally:
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
-    words = "collector.cars=100, algorithm.frames_per_iteration=10000000: needs more memory than there is"
-    refused.assert_refused(words)
+    refused.assert_refused(f"{', '.join(overrides)}: needs more memory than there is")
     assert refused.summary["status"] == "failed"
 
 
