@@ -36,14 +36,17 @@ def place(request, tmp_path):
     return lambda files: written(files, tmp_path, request.param)
 
 
-@pytest.fixture(scope="module", params=["folder", "archive"])
-def recording_of(request, tmp_path_factory):
-    """Return what is read of a layout, read once for all tests."""
+@pytest.fixture(scope="module")
+def read(tmp_path_factory):
+    """Return what is read of a layout in a folder or an archive, read once for all tests."""
     return cache(
-        lambda layout: read_recording(
-            written(LAYOUTS[layout](), tmp_path_factory.mktemp(layout), request.param)
-        )
+        lambda layout, kind: read_recording(written(LAYOUTS[layout](), tmp_path_factory.mktemp(layout), kind))
     )
+
+
+@pytest.fixture(params=["folder", "archive"])
+def recording_of(request, read):
+    return lambda layout: read(layout, request.param)
 
 
 def check_table(table: pd.DataFrame, columns) -> None:

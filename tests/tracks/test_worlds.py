@@ -1,5 +1,8 @@
 """The worlds of the service, compared with its own route files and with recordings."""
 
+from functools import cache
+from pathlib import Path
+
 import numpy as np
 import pytest
 import shapely
@@ -25,12 +28,17 @@ RECORDINGS = {
 }
 
 
-@pytest.fixture(scope="module", params=RECORDINGS)
+@cache
+def places_of(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return the recorded places and the closest waypoint recorded with each."""
+    steps = read_recording(path).steps
+    return steps[["X", "Y"]].to_numpy(np.float64), steps["closest_waypoint"].to_numpy(np.intp)
+
+
+@pytest.fixture(params=RECORDINGS)
 def recorded(request, reference):
-    """Return a world, the places recorded on it and the closest waypoint recorded with each."""
-    steps = read_recording(reference / request.param).steps
-    places = steps[["X", "Y"]].to_numpy(np.float64)
-    return RECORDINGS[request.param], places, steps["closest_waypoint"].to_numpy(np.intp)
+    """Return a world, and what `places_of` returns of a recording on it."""
+    return RECORDINGS[request.param], *places_of(reference / request.param)
 
 
 def test_recorded_closest_waypoints_are_those_of_the_world(recorded):
