@@ -234,12 +234,20 @@ def test_ranges_beyond_the_cars_are_named_with_its_own() -> None:
         ),
     ],
 )
-def test_a_racer_is_told_before_a_training_starts(
-    train_here: Any, reference: Path, file: str, words: list[str]
+def test_files_of_racers_with_actions_that_the_car_makes_equal_are_remarked_upon(
+    reference: Path, file: str, words: list[str]
 ) -> None:
-    ended = train_here(f"action_space.file={reference / 'inputs' / file}")
+    config = compose_option("action_space", "discrete", ActionSpaceConfig)
+    remarks = action_remarks(build_action_space(with_file(config, reference / "inputs" / file)), CAR)
+    for word in words:
+        assert any(word in line for line in remarks)
+
+
+def test_a_racer_is_told_before_a_training_starts(train_here: Any) -> None:
+    ended = train_here(
+        "action_space.steering_angle.high=45", "budget.iterations=1", "report=false", "evaluation.trials=1"
+    )
     assert ended.code == 0, ended.stderr
     log = (ended.folder / "log.txt").read_text(encoding="utf-8")
-    for word in words:
-        assert word in ended.stderr
-        assert word in log
+    for text in (ended.stderr, log):
+        assert "steering_angle from -30 to 45 degrees: the car cuts it to -30 to 30" in text

@@ -13,7 +13,7 @@ from deepracer_exp.errors import BadInput
 from tests.env.conftest import drive, spied
 
 THREE = ("track=[reinvent_wood,Straight_track,Spain_track]", "track.Spain_track.direction=reversed")
-WAYS = ("action_space=continuous", "episode.max_steps=40", "randomization=sim2real")
+WAYS = ("action_space=continuous", "episode.max_steps=20", "randomization=sim2real")
 GIVEN = """
 import numpy as np
 def reward_function(params):
@@ -61,7 +61,7 @@ def test_the_number_of_processes_does_not_change_a_cars_course(setup_of):
 
 
 def test_each_car_drives_bit_for_bit_as_alone_on_its_course(race_of):
-    actions = np.random.default_rng(4).uniform(-1, 1, (90, 6, 2))
+    actions = np.random.default_rng(4).uniform(-1, 1, (50, 6, 2))
     race = race_of(*THREE, *WAYS, n_cars=6)
     np.testing.assert_array_equal(race.rules.course, [0, 1, 2, 0, 1, 2])
     rows = drive(race, actions)
@@ -190,6 +190,7 @@ def test_gym_cars_are_shared_out_and_each_track_needs_one():
         DeepRacerVectorEnv(2, [THREE[0]])
 
 
+@pytest.mark.slow
 def test_all_tracks_drive_together(race_of):
     race = race_of("track=all", n_cars=100)
     drive(race, np.full((3, 100), 2))

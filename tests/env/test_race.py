@@ -113,8 +113,15 @@ def test_the_clock_runs_at_the_control_rate_of_the_car(race_of, column):
 # --- The params of a reward function
 
 
-@pytest.mark.parametrize("direction", ["forward", "reversed"])
-@pytest.mark.parametrize("name", ["reinvent_base", "Spain_track", "Straight_track"])
+@pytest.mark.parametrize(
+    ("name", "direction"),
+    [
+        ("reinvent_base", "forward"),
+        ("Spain_track", "reversed"),
+        ("Straight_track", "forward"),
+        ("Straight_track", "reversed"),
+    ],
+)
 def test_params_are_what_shapely_says_of_the_pose(race_of, column, steer_ahead, spy, name, direction):
     race = race_of(f"track={name}", f"track.direction={direction}", spy, "action_space=continuous", n_cars=3)
     track, rng = race.setup.track, np.random.default_rng(2)

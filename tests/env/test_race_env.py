@@ -12,21 +12,22 @@ from deepracer_exp.env.trace_columns import PACKED
 SPACES = ["action_space=discrete", "action_space=continuous"]
 
 
-@pytest.mark.parametrize("sensors", ["features", "camera_small", "lidar", "camera_lidar"])
-@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize(
+    ("space", "sensors"), [(SPACES[0], "features"), (SPACES[1], "features"), (SPACES[1], "camera_lidar")]
+)
 def test_specs_and_rollouts_agree(setup_of, space, sensors):
     check_env_specs(RaceEnv(Race(setup_of(space, f"observation={sensors}"), 3)))
 
 
 @pytest.mark.parametrize("space", SPACES)
 def test_the_short_step_gives_exactly_what_the_generic_one_gives(setup_of, space):
-    """300 steps; episodes end by the limit and off the track, and some steps end none."""
-    setup = setup_of(space, "episode.max_steps=45", "randomization=aws")
+    """120 steps; episodes end by the limit and off the track, and some steps end none."""
+    setup = setup_of(space, "episode.max_steps=25", "randomization=aws")
     ours, generic = (RaceEnv(Race(setup, 5)) for _ in range(2))
     assert type(ours).step_and_maybe_reset is not EnvBase.step_and_maybe_reset
     root, generic_root = ours.reset(), generic.reset()
     ended = set()
-    for _ in range(300):
+    for _ in range(120):
         action = ours.action_spec.rand()
         stepped, root = ours.step_and_maybe_reset(root.set("action", action))
         expected, generic_root = generic._step_and_maybe_reset(generic_root.set("action", action.clone()))

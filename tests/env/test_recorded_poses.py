@@ -17,7 +17,7 @@ from tests.conftest import REFERENCE
 
 TRACES = REFERENCE / "console_training/sim-trace"
 FRONT_M = 0.14
-JUDGED = ("progress", "all_wheels_on_track", "status", "done", "closest_waypoint", "reward", "steps")
+JUDGED = ("progress", "all_wheels_on_track", "status", "done", "reward", "steps")
 
 # The console's sample for following the centre line, in our words.
 FOLLOW = """
@@ -57,25 +57,27 @@ def judged(rows: pd.DataFrame, setup) -> pd.DataFrame:
     begun = setup.track.project(first[["X", "Y"]].to_numpy()).ndist - first["progress"].to_numpy() / 100
     rules.reset(start_ndist=begun % 1)
     out = np.empty((steps, cars, len(JUDGED)))
+    closest, front = np.empty((steps, cars, 2), np.intp), np.empty((steps, cars, 2))
     for at in range(steps):
         rules.measure(CarState(*poses[:, at], *np.zeros((4, cars))))
         result = rules.apply()
         paid = reward(
             rules.params(result, np.zeros(cars), np.zeros(cars)), rules.track_params, result.running
         )
-        closest, waypoints = (result.now.closest_waypoints, result.now.front), rules.tracks.waypoints[0]
+        closest[at], front[at] = result.now.closest_waypoints, result.now.front
         out[at] = np.column_stack(
             [
                 result.progress,
                 result.all_wheels_on_track,
                 result.status,
                 result.terminated | result.truncated,
-                [nearer_of(*around, waypoints, 0) for around in zip(*closest, strict=True)],
                 paid,
                 rules.steps,
             ]
         )
     table = pd.DataFrame(out[step, car], columns=JUDGED)
+    around = zip(closest[step, car], front[step, car], strict=True)
+    table["closest_waypoint"] = [nearer_of(*pair, rules.tracks.waypoints[0], 0) for pair in around]
     table["status"] = [EPISODE_STATUS[int(code)] for code in table["status"]]
     return table.assign(start=(begun % 1)[car])
 

@@ -25,6 +25,7 @@ from deepracer_exp.env.trace_rows import row_dtype
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.runs.trace import DECIMALS, MOST_ROWS, TraceWriter, read_trace
 from tests.conftest import REFERENCE, refused
+from tests.examples import examples
 
 CONSOLE = REFERENCE / "console_training/sim-trace/training/training-simtrace"
 WHOLE = ("episode", "steps", "action", "closest_waypoint", "car")
@@ -134,6 +135,7 @@ def test_what_was_written_is_read_in_the_order_of_iterations(tmp_path: Path) -> 
 
 
 @given(reward=st.floats(-1e30, 1e30, allow_subnormal=False))
+@examples(100)
 def test_a_reward_of_any_size_keeps_seven_digits(
     reward: float, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
@@ -156,8 +158,12 @@ def test_the_rows_of_all_iterations_since_the_last_file_are_in_the_next(tmp_path
     assert read_trace(tmp_path)["iteration"].tolist() == [1] * 7 + [2] * 7 + [3] * 7 + [4] * 7
 
 
-def test_a_file_is_written_before_its_rows_fill_the_memory(tmp_path: Path) -> None:
-    TraceWriter(tmp_path).add(5, table(MOST_ROWS))
+def test_a_file_is_written_before_its_rows_fill_the_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert MOST_ROWS <= 200_000
+    monkeypatch.setattr("deepracer_exp.runs.trace.MOST_ROWS", 1000)
+    TraceWriter(tmp_path).add(5, table(1000))
     assert [path.name for path in tmp_path.iterdir()] == ["00005-iteration.parquet"]
 
 
