@@ -1,5 +1,5 @@
 from collections.abc import Callable
-from functools import cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +12,9 @@ from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.env.trace_columns import PACKED
 
 
-@cache
+@lru_cache(maxsize=40)  # a setup of one track holds megabytes
 def make_setup(*overrides: str) -> RaceSetup:
-    """Compose and build a setup, once for all tests: the list of 15 actions and plain cars, unless others are named."""
+    """Compose and build a setup: the list of 15 actions and plain cars, unless others are named."""
     plain = [
         f"{group}={option}"
         for group, option in (("action_space", "discrete"), ("randomization", "none"))

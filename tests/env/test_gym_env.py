@@ -96,7 +96,7 @@ def test_the_vector_environment_is_made_by_name():
 
 
 def test_one_batch_of_cars_equals_gymnasiums_vector_of_single_cars():
-    """Over 100 steps, the infos of ended episodes included; all cars start at one place, as single cars do."""
+    """Over 80 steps, the infos of ended episodes included; all cars start at one place, as single cars do."""
     overrides = ["action_space=continuous", "episode.max_steps=35", "episode.start_advance=0"]
     overrides.append("randomization=none")  # which differs by the number of the car, 0 for each single one
     ours = DeepRacerVectorEnv(3, overrides)
@@ -107,7 +107,7 @@ def test_one_batch_of_cars_equals_gymnasiums_vector_of_single_cars():
         row.action_space,
     )
     ended = 0
-    for action in np.random.default_rng(0).uniform(-1, 1, (100, 3, 2)).astype(np.float32):
+    for action in np.random.default_rng(0).uniform(-1, 1, (80, 3, 2)).astype(np.float32):
         *a, infos = ours.step(action)
         *b, expected = row.step(action)
         for mine, theirs in zip(a, b, strict=True):
@@ -161,14 +161,14 @@ def test_gymnasiums_vector_wrappers_take_it():
 
 @pytest.mark.parametrize("space", SPACES)
 def test_stable_baselines_trains_on_the_vector_environment_and_logs_its_episodes(space):
-    cars = VecMonitor(DeepRacerVecEnv(8, [space, "episode.max_steps=40"]))
-    model = PPO("MlpPolicy", cars, n_steps=32, batch_size=64, n_epochs=2, device="cpu", seed=0)
+    cars = VecMonitor(DeepRacerVecEnv(8, [space, "episode.max_steps=12"]))
+    model = PPO("MlpPolicy", cars, n_steps=16, batch_size=64, n_epochs=1, device="cpu", seed=0)
     before = [p.clone() for p in model.policy.parameters()]
-    model.learn(3 * 8 * 32)
-    assert model.num_timesteps == 768
+    model.learn(2 * 8 * 16)
+    assert model.num_timesteps == 256
     assert all(p.isfinite().all() for p in model.policy.parameters())
     assert any((p != q).any() for p, q in zip(model.policy.parameters(), before, strict=True))
-    assert 0 < np.mean([episode["l"] for episode in model.ep_info_buffer]) <= 40
+    assert 0 < np.mean([episode["l"] for episode in model.ep_info_buffer]) <= 12
 
 
 def test_stable_baselines_drives_the_same_cars_and_is_told_how_episodes_ended():
@@ -193,9 +193,9 @@ def test_stable_baselines_drives_the_same_cars_and_is_told_how_episodes_ended():
 
 def test_stable_baselines_trains_on_a_single_car():
     cars = DummyVecEnv([lambda: gym.make("DeepRacer-v0", overrides=[SPACES[0], "episode.max_steps=40"])])
-    model = PPO("MlpPolicy", cars, n_steps=64, batch_size=32, n_epochs=1, device="cpu", seed=0)
-    model.learn(128)
-    assert model.num_timesteps == 128
+    model = PPO("MlpPolicy", cars, n_steps=32, batch_size=32, n_epochs=1, device="cpu", seed=0)
+    model.learn(64)
+    assert model.num_timesteps == 64
     assert all(p.isfinite().all() for p in model.policy.parameters())
 
 

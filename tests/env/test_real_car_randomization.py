@@ -145,7 +145,7 @@ def test_any_number_of_threads_takes_the_same_pictures(option):
     races = [Race(setup, 19, threads=threads) for threads in (1, 3)]
     for race in races:
         race.reset()
-        for action in random_actions(2, 19):
+        for action in random_actions(1, 19):
             race.step(action)
     np.testing.assert_array_equal(races[0].pixels, races[1].pixels)
     assert len(np.unique(races[0].pixels, axis=0)) == 19
