@@ -36,7 +36,7 @@ def most_steps(monkeypatch):
 
 
 def test_the_last_steps_of_a_log_too_long_for_memory_are_kept_and_the_others_counted(most_steps):
-    raw = 20 * "".join(made.log_text(made.drives([drive], seed=drive)) for drive in range(200)).encode()
+    raw = 80 * "".join(made.log_text(made.drives([drive], seed=drive)) for drive in range(50)).encode()
     assert len(raw) > 2**21
     lines = raw.count(b"SIM_TRACE_LOG")
     whole = read_training_log(raw).steps

@@ -105,6 +105,7 @@ def test_settings_are_those_of_the_training(recording):
     assert recording.hyperparameters["num_epochs"] == 3
 
 
+@pytest.mark.slow
 def test_the_archive_of_the_folder_reports_the_same(recording, tmp_path):
     path = tmp_path / "logs.tar.gz"
     with tarfile.open(path, "w:gz", compresslevel=1) as archive:
