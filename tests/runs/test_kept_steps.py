@@ -96,7 +96,7 @@ def test_another_word_is_refused_with_those_accepted():
     ("kept", "why"), [("off", "it was trained with trace=off"), ("laps", "trace=laps keeps complete laps")]
 )
 def test_every_reader_says_in_a_line_what_is_missing(trained, call, kept, why):
-    run = trained("budget.iterations=2", "report=true", f"trace={kept}")
+    run = trained("budget.iterations=1", "report=true", "evaluation.trials=1", f"trace={kept}")
     assert run.code == 0, run.stderr
     assert f"no report.html, no best_lap.png: the run has no trace: {why}" in run.stderr + run.stdout
     assert (run.folder / "learning.png").is_file()
