@@ -73,7 +73,7 @@ def test_aliases_count_each_time_and_may_be_used(tmp_path):
         read_yaml(path, "YAML")
 
 
-@pytest.mark.timeout(20)
+@pytest.mark.timeout(300)
 def test_a_pipe_among_the_evaluations_of_a_run_is_left_out(tmp_path):
     (tmp_path / "evaluations").mkdir()
     os.mkfifo(tmp_path / "evaluations" / "1.json")

@@ -111,6 +111,7 @@ def test_every_material_has_a_colour_of_its_floor():
 
 
 VARIED = (SMALL, "randomization=sim2real")
+AMONG = ("race=head_to_bot", "race.boxes.number=2", "track=reInvent2019_track")
 
 
 def test_light_differs_from_episode_to_episode_and_car_to_car(race_of):
@@ -221,8 +222,7 @@ def test_a_lens_changes_no_other_draw(race_of):
 
 
 def test_boxes_and_bots_look_different_in_every_episode_and_stand_where_they_stand(race_of):
-    among = ("race=head_to_bot", "race.boxes.number=2", "track=reInvent2019_track")
-    race = race_of(*VARIED, *among, n_cars=3)
+    race = race_of(*VARIED, *AMONG, n_cars=3)
     ids = np.arange(3)
     looks = []
     for _ in range(2):
@@ -242,7 +242,7 @@ def test_boxes_and_bots_look_different_in_every_episode_and_stand_where_they_sta
 
 def test_the_looks_of_others_change_no_other_draw(race_of):
     alone = race_of(*VARIED, "track=reInvent2019_track", n_cars=4)
-    among = race_of(*VARIED, "track=reInvent2019_track", "race=head_to_bot", n_cars=4)
+    among = race_of(*VARIED, *AMONG, n_cars=4)
     for name in ("_values", "_boxes", "_dirt", "_spot", "_color_factor", "_noise_start"):
         assert np.array_equal(getattr(alone._varied, name), getattr(among._varied, name))
 
