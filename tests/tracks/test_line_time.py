@@ -47,12 +47,13 @@ def test_a_lap_from_standstill_is_slower_by_what_it_takes_to_gain_speed():
     # Half of the time to the speed of the ring, if the line were the same.
     speed = float(ABILITY.speed_at(np.array(1 / INSIDE_M)))
     assert standing - flying == pytest.approx(0.5 * speed / ABILITY.accelerate_mps2, abs=0.08)
-    assert fastest_line(COURSE, REACH_M, pulling_away, start_ndist=0.25)[0] < standing
+    assert fastest_line(COURSE, REACH_M, pulling_away, 0.25, driven=line)[0] < standing
 
 
 def test_a_lap_ends_when_the_front_of_the_car_is_at_the_line():
-    short, _ = fastest_line(COURSE, REACH_M, ABILITY, 0.25, short_m=0.3)
-    assert 0.05 < fastest(0.25)[0] - short < 0.2
+    whole, line = fastest(0.25)
+    short, _ = fastest_line(COURSE, REACH_M, ABILITY, 0.25, short_m=0.3, driven=line)
+    assert 0.05 < whole - short < 0.2
 
 
 def test_the_line_of_a_driven_lap_is_never_better_than_the_least_time():
