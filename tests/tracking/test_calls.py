@@ -1,6 +1,5 @@
 """Servers that answer with an error, with something else, slowly or never."""
 
-import time
 from collections.abc import Callable, Iterator
 from functools import partialmethod
 
@@ -13,6 +12,7 @@ from deepracer_exp.tracking.registry import look_up
 from deepracer_exp.tracking.store import resolve_store
 from deepracer_exp.tracking.tracker import ProjectedTracker
 from tests.conftest import refused
+from tests.waiting import wait_until
 
 from .conftest import TrackerHere, begin, write_rows
 from .odd_servers import odd_server
@@ -33,8 +33,8 @@ ODD = {
 @pytest.fixture(params=ODD)
 def odd(request, free_port, monkeypatch) -> Iterator[tuple[str, str]]:
     """Address of an odd server, and what is said of it."""
-    monkeypatch.setenv("MLFLOW_HTTP_REQUEST_TIMEOUT", "2")
-    monkeypatch.setattr(calls, "CALL_S", 4.0)
+    if request.param in ("hang", "drip"):
+        monkeypatch.setattr(calls, "CALL_S", 0.02)
     if request.param == "closed":
         yield f"http://127.0.0.1:{free_port}", ODD["closed"]
         return
@@ -56,16 +56,16 @@ def test_a_run_that_is_not_recorded_says_so_and_why(odd, tmp_path):
     tracker = TrackerHere(resolve_store(uri, tmp_path))
     begin(tracker, tmp_path, params={"seed": "1"})
     write_rows(tmp_path, [{"completion": 5.0}])
-    while tracker.outage is None:
-        time.sleep(0.5)  # how long a call may take counts the CPU time of this process
-    tracker.finish("FINISHED", deadline_s=1.0)
+    wait_until(lambda: tracker.outage, "outage")
+    # A limit of CPU time, of which attempts in this process use little.
+    tracker.finish("FINISHED", deadline_s=0.05)
     assert tracker.failure is not None
     assert tracker.failure.startswith(f"MLflow ({uri}): some of this run was not recorded: ")
     assert words in tracker.failure
 
 
 def test_a_person_who_waits_is_told_so(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(calls, "CALL_S", 1.0)
+    monkeypatch.setattr(calls, "CALL_S", 0.6)
     monkeypatch.setattr(calls, "_SAY_AFTER_S", 0.1)
     with odd_server("hang") as uri:
         assert "no answer within 1 s" in refused(look_up, "x@champion", uri, tmp_path)

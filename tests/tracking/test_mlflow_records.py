@@ -117,15 +117,15 @@ def test_all_that_has_come_up_is_one_request(store, batches, tmp_path):
 def test_a_run_is_written_to_no_more_often_than_every_few_seconds(
     store, batches, monkeypatch, wait_until, tmp_path
 ):
-    monkeypatch.setattr(projector, "UPDATE_S", 0.4)
+    monkeypatch.setattr(projector, "UPDATE_S", 0.3)
     began = time.monotonic()
     tracker = TrackerHere(store)
     begin(tracker, tmp_path)
-    for number in range(40):
+    for number in range(20):
         write_rows(tmp_path, [{"kl": float(number)}])
-        time.sleep(0.05)
-    wait_until(lambda: sum(metrics for metrics, *_ in batches) == 40 * 3)
-    assert len(batches) <= 1 + (time.monotonic() - began) / 0.4
+        time.sleep(0.03)
+    wait_until(lambda: sum(metrics for metrics, *_ in batches) == 20 * 3)
+    assert len(batches) <= 1 + (time.monotonic() - began) / 0.3
 
 
 def test_a_parameter_that_is_refused_costs_no_metric(store, mlflow, tmp_path):
@@ -169,7 +169,8 @@ def test_a_server_that_is_down_costs_no_training_and_shows_no_password(
     write_rows(tmp_path, [{"kl": 1.0}] * 6, covered=5)
     wait_until(lambda: tracker.outage is not None)
     assert not caplog.records
-    tracker.finish("FAILED", deadline_s=1)
+    # A limit of CPU time, of which attempts in this process use little.
+    tracker.finish("FAILED", deadline_s=0.05)
     for words in ("some of this run was not recorded", f"http://127.0.0.1:{free_port}"):
         assert words in caplog.text
     assert tracker.failure is not None
@@ -179,9 +180,11 @@ def test_a_server_that_is_down_costs_no_training_and_shows_no_password(
     assert not [file for file in tmp_path.glob("*.json") if "s3cr3t" in file.read_text()]
 
 
-def test_two_processes_that_begin_at_once_in_a_new_folder_lose_nothing(tmp_path):
+@pytest.mark.parametrize("kind", [TrackerHere, pytest.param(ProjectedTracker, marks=pytest.mark.faults)])
+def test_two_runs_that_begin_at_once_in_a_new_folder_lose_nothing(kind, tmp_path):
+    """Recorded by threads, and by processes, which import MLflow for seconds each."""
     runs = tmp_path / "meine Läufe mit ß" / "50%#"
-    trackers = [ProjectedTracker(resolve_store(None, runs)) for _ in range(2)]
+    trackers = [kind(resolve_store(None, runs)) for _ in range(2)]
     folders = [tmp_path / str(seed) for seed in range(2)]
     for seed, (tracker, folder) in enumerate(zip(trackers, folders, strict=True)):
         folder.mkdir()
