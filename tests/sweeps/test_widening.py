@@ -20,6 +20,7 @@ from tests.conftest import refused
 
 LR = "algorithm.lr=tag(log,interval(1e-5,1e-3))"
 NETWORK = "network=mlp_small,mlp"
+in_a_file = pytest.mark.parametrize("url", ["sqlite"], indirect=True)
 
 
 @pytest.fixture(autouse=True)
@@ -84,6 +85,7 @@ def test_a_search_with_another_choice_and_a_wider_interval_keeps_the_trials(made
     )
 
 
+@in_a_file
 def test_a_key_that_was_fixed_gets_the_value_that_trials_were_trained_with(made):
     made(LR, "algorithm.entropy_coeff=0.02", "network=mlp_small", "sweep.trials=3")
     after = made(
@@ -96,23 +98,22 @@ def test_a_key_that_was_fixed_gets_the_value_that_trials_were_trained_with(made)
     assert all(len(trial.params) == 4 for trial in after[3:])
 
 
-@pytest.mark.parametrize(
-    "asked",
-    [
+@in_a_file
+def test_a_search_that_leaves_something_out_or_changes_every_trial_is_refused(made, started):
+    before = made(LR, NETWORK, "sweep.trials=2")
+    for asked in (
         ("algorithm.lr=tag(log,interval(1e-4,1e-3))", NETWORK),
         ("algorithm.lr=interval(1e-5,1e-3)", NETWORK),
         (LR, "network=mlp,mlp_deep"),
         (LR,),
         (LR, "network=mlp_small,mlp,mlp_deep", "track=Oval_track"),
         (LR, "network=mlp_small,mlp,mlp_deep", "sweep.seeds=2"),
-    ],
-)
-def test_a_search_that_leaves_something_out_or_changes_every_trial_is_refused(made, started, asked):
-    before = made(LR, NETWORK, "sweep.trials=2")
-    assert "exists with another search" in refused(started, *asked, "sweep.trials=4")
-    assert made(LR, NETWORK, "sweep.trials=2") == before
+    ):
+        assert "exists with another search" in refused(started, *asked, "sweep.trials=4"), asked
+        assert made(LR, NETWORK, "sweep.trials=2") == before, asked
 
 
+@in_a_file
 def test_a_study_with_a_running_trial_is_not_widened(started, storage):
     started(LR, NETWORK, "sweep.trials=2")
     claims = TrialClaims(storage.engine, "s")
@@ -122,7 +123,16 @@ def test_a_study_with_a_running_trial_is_not_widened(started, storage):
     assert started(LR, "network=mlp_small,mlp,mlp_deep", "sweep.trials=2")
 
 
-@pytest.mark.parametrize("killed_in", ["add_trial", "delete_study", "copy_study"])
+@pytest.mark.parametrize(
+    ("url", "killed_in"),
+    [
+        ("sqlite", "add_trial"),
+        ("sqlite", "delete_study"),
+        ("sqlite", "copy_study"),
+        ("postgresql", "copy_study"),
+    ],
+    indirect=["url"],
+)
 def test_whatever_kills_the_process_no_trial_is_lost(made, started, storage, monkeypatch, killed_in):
     before = made(LR, NETWORK, "sweep.trials=3")
     wider = (LR, "network=mlp_small,mlp,mlp_deep", "sweep.trials=3")
@@ -141,6 +151,7 @@ def test_whatever_kills_the_process_no_trial_is_lost(made, started, storage, mon
     ]
 
 
+@in_a_file
 def test_known_settings_are_tried_first_and_once(made):
     asked = (LR, NETWORK, "sweep.enqueue=[{algorithm.lr: 5e-4, network: mlp}, {algorithm.lr: 2e-4}]")
     trials = made(*asked, "sweep.trials=4")
@@ -157,22 +168,21 @@ def test_known_settings_are_tried_first_and_once(made):
     assert more[4].params["algorithm.lr"] == 3e-4
 
 
+@in_a_file
 def test_a_run_gives_its_values_of_the_searched_keys(made, trained, tmp_path):
     run = trained("algorithm.lr=4e-4").folder
     (first, *_) = made(LR, NETWORK, f"sweep.enqueue=[{run}]", "sweep.trials=1")
     assert first.params["algorithm.lr"] == 4e-4
 
 
-@pytest.mark.parametrize(
-    ("setting", "words"),
-    [
-        ("{algorithm.lr: 1.0}", ["algorithm.lr=1.0 is not searched", LR]),
-        ("{network: mlp_deep}", ["network=mlp_deep is not searched", NETWORK]),
-        ("{algorithm.epochs: 3}", ["algorithm.epochs is not searched", "algorithm.lr"]),
-        ("{}", ["none of the keys that are searched"]),
-        ("no_such_run", ["no_such_run"]),
-    ],
-)
-def test_a_setting_outside_the_search_is_refused(started, setting, words):
-    message = refused(started, LR, NETWORK, f"sweep.enqueue=[{setting}]", "sweep.trials=1")
-    assert all(word in message for word in words)
+@in_a_file
+def test_a_setting_outside_the_search_is_refused(started):
+    for setting, words in {
+        "{algorithm.lr: 1.0}": ["algorithm.lr=1.0 is not searched", LR],
+        "{network: mlp_deep}": ["network=mlp_deep is not searched", NETWORK],
+        "{algorithm.epochs: 3}": ["algorithm.epochs is not searched", "algorithm.lr"],
+        "{}": ["none of the keys that are searched"],
+        "no_such_run": ["no_such_run"],
+    }.items():
+        message = refused(started, LR, NETWORK, f"sweep.enqueue=[{setting}]", "sweep.trials=1")
+        assert all(word in message for word in words), message
