@@ -25,7 +25,7 @@ def main() -> int:
             tests = [
                 "-q",
                 "-m",
-                "processes and not slow",
+                "processes and not slow and not faults",
                 "-n",
                 "2",
                 "--dist",

@@ -1,11 +1,16 @@
 """Ctrl-C and SIGTERM, sent to all processes of a run, as terminals and service managers do."""
 
+import multiprocessing
+import os
 import signal
 import time
 
 import pytest
 
 from deepracer_exp.runs.trace import read_trace
+from tests.conftest import IN_WORKERS, iterations
+
+from .conftest import meanwhile
 
 
 def _assert_whole(ended, code):
@@ -21,10 +26,22 @@ def _assert_whole(ended, code):
     assert not (ended.folder / ".heartbeat").exists()
 
 
-@pytest.mark.parametrize(
-    ("signum", "code"),
-    [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)],
-)
+@pytest.mark.usefixtures("workers_start_early")
+def test_ctrl_c_of_a_training_in_this_process_writes_everything(call, tmp_path):
+    def press() -> None:
+        workers = [one.pid for one in multiprocessing.active_children()]
+        assert len(workers) == 2
+        for pid in (*workers, os.getpid()):
+            os.kill(pid, signal.SIGINT)
+
+    with meanwhile(lambda: iterations(tmp_path) >= 2, press):
+        ended = call("train", *IN_WORKERS, "budget.env_steps=100000000")
+    _assert_whole(ended, 130)
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize(("signum", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_an_interrupted_run_writes_everything(start_training, signum, code):
     training = start_training("collector=sync")
     training.wait_for_iterations(2)
@@ -34,7 +51,7 @@ def test_an_interrupted_run_writes_everything(start_training, signum, code):
     training.assert_nothing_left()
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 def test_an_interruption_while_the_workers_start_ends_after_one_iteration(start_training):
     training = start_training()
     training.wait_for_worker()
@@ -45,7 +62,7 @@ def test_an_interruption_while_the_workers_start_ends_after_one_iteration(start_
     training.assert_nothing_left()
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 @pytest.mark.parametrize("after_s", [0.3, 1.0, 2.0])
 def test_an_interruption_before_the_run_has_a_folder_is_reported_by_the_exit_code(start_training, after_s):
     training = start_training()
@@ -59,7 +76,7 @@ def test_an_interruption_before_the_run_has_a_folder_is_reported_by_the_exit_cod
     training.assert_nothing_left()
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 def test_a_second_interruption_ends_at_once(start_training, tmp_path):
     """The iteration would take longer than the test waits for the end: cars that sleep."""
     (tmp_path / "slow.py").write_text(
@@ -80,7 +97,7 @@ def test_a_second_interruption_ends_at_once(start_training, tmp_path):
     training.assert_nothing_left()
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 def test_an_interrupted_grid_runs_no_further_combination(start_training):
     training = start_training("-m", "seed=1,2")
     training.wait_for_iterations(1)

@@ -24,7 +24,7 @@ from .test_killed_sweeps import Sweep, assert_every_trial_is_accounted_for_once,
 KILLS = int(os.environ.get("FAULT_TIMES", "1"))
 MANY = "sweep.trials=10000"
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800 * KILLS)]
+pytestmark = [pytest.mark.faults, pytest.mark.timeout(1800 * KILLS)]
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from mlflow import MlflowClient
 from deepracer_exp.tracking.mlflow_metrics import metric_name
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 def test_a_recording_killed_again_and_again_leaves_every_point_once(tmp_path):
     kills = 5
     uri = f"sqlite:///{tmp_path}/mlflow.db"
@@ -49,7 +49,7 @@ MLflowRun(resolve_store(None, pathlib.Path(sys.argv[1])))
 """
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 def test_a_store_whose_creation_was_killed_is_created_again(tmp_path):
     command = [sys.executable, "-c", _CREATES, str(tmp_path)]
     killed = subprocess.Popen([*command, "killed"], stdout=subprocess.PIPE, text=True)

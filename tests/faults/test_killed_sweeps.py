@@ -4,6 +4,7 @@
 """
 
 import contextlib
+import multiprocessing
 import os
 import random
 import signal
@@ -21,6 +22,8 @@ from deepracer_exp.sweeps.queue.storage import open_storage
 from deepracer_exp.sweeps.trial import Trial
 from tests.waiting import PATIENCE_S
 
+from .conftest import meanwhile
+
 TIMES = range(int(os.environ.get("FAULT_TIMES", "1")))
 TRIALS, ITERATIONS = 3, 6
 SWEEP = (
@@ -29,6 +32,8 @@ SWEEP = (
     *("algorithm.lr=tag(log,interval(1e-5,1e-3))", "sweep.protocol=three_trials", "sweep.rerank=0"),
     *(f"sweep.trials={TRIALS}", "sweep.lease_s=6"),
 )
+
+SMALL = ("budget.iterations=2", "algorithm.frames_per_iteration=256", "checkpoints.every=1")
 
 
 class Sweep:
@@ -108,6 +113,7 @@ def assert_every_trial_is_accounted_for_once(cwd, storage=None, trials=TRIALS, i
     assert len({trial.params["algorithm.lr"] for trial in known}) == trials
 
 
+@pytest.mark.faults
 @pytest.mark.parametrize("seed", TIMES)
 def test_after_kill_9_of_the_only_worker_another_one_continues(sweep, tmp_path, seed):
     running = sweep("sweep.workers=1", "algorithm.frames_per_iteration=256", at_random=random.Random(seed))
@@ -116,6 +122,53 @@ def test_after_kill_9_of_the_only_worker_another_one_continues(sweep, tmp_path, 
             worker.kill()
     running.end()
     assert_every_trial_is_accounted_for_once(tmp_path)
+
+
+@pytest.mark.usefixtures("workers_start_early")
+def test_a_worker_killed_in_the_middle_of_a_trial_is_replaced_and_each_trial_counts_once(call, tmp_path):
+    """The reward function of the second trial kills its worker, the only one, once."""
+    (tmp_path / "deadly.py").write_text(
+        "import os, pathlib\n\n\n"
+        "def reward_function(params):\n"
+        "    deadly = pathlib.Path('deadly')\n"
+        "    if len(list(pathlib.Path().glob('runs/s/*/metrics.jsonl'))) == 2 and deadly.exists():\n"
+        "        deadly.unlink()\n"
+        "        os.kill(os.getpid(), 9)\n"
+        "    return params['speed']\n"
+    )
+    (tmp_path / "deadly").touch()
+    ended = call(*SWEEP, *SMALL, "sweep.workers=1", "reward.file=deadly.py")
+    assert ended.code == 0, ended.stderr
+    assert not (tmp_path / "deadly").exists()
+    assert_every_trial_is_accounted_for_once(tmp_path, iterations=2)
+    assert sorted(claim.attempt for claim in claims(tmp_path)) == [1, 1, 2]
+
+
+@pytest.mark.usefixtures("workers_start_early")
+def test_ctrl_c_of_a_sweep_in_this_process_leaves_its_trials_ready_to_resume(call, tmp_path):
+    def rows() -> int:
+        return sum(file.read_bytes().count(b"\n") for file in tmp_path.glob("runs/s/*/metrics.jsonl"))
+
+    with meanwhile(lambda: rows() >= 3, lambda: os.kill(os.getpid(), signal.SIGINT)):
+        ended = call(*SWEEP, *SMALL, "sweep.workers=2", "sweep.trials=1000")
+    assert ended.code == 130
+    assert "Traceback" not in ended.stderr + (tmp_path / "runs" / "s" / "workers.log").read_text()
+    assert ended.stderr.splitlines()[-1] == "interrupted; resume it with: deepracer-exp sweep study=s"
+    assert not multiprocessing.active_children()
+    trials = assert_those_under_way_can_be_resumed(tmp_path)
+    assert call("sweep", "study=s", f"sweep.trials={trials}").code == 0
+    assert_every_trial_is_accounted_for_once(tmp_path, trials=trials, iterations=2)
+
+
+def assert_those_under_way_can_be_resumed(cwd):
+    """Return how many trials would begin none anew."""
+    begun = claims(cwd)
+    assert {claim.attempt for claim in begun} == {1}
+    open_ones = [claim for claim in begun if not claim.has_ended]
+    assert len(open_ones) <= 2
+    assert all(claim.expired for claim in open_ones)
+    # Workers that claimed at the same moment may have left a gap.
+    return 1 + max(claim.trial.number for claim in begun)
 
 
 def interrupted(running, times=1):
@@ -130,22 +183,17 @@ def interrupted(running, times=1):
     running.command.assert_nothing_left()
 
 
+@pytest.mark.faults
 def test_ctrl_c_begins_no_other_trial_and_leaves_those_under_way_ready_to_resume(sweep, tmp_path):
     running = sweep("sweep.workers=2", "sweep.trials=1000")
     running.wait_for(lambda: running.rows() >= ITERATIONS + 1, "rows")
     interrupted(running)
-    begun = claims(tmp_path)
-    assert {claim.attempt for claim in begun} == {1}
-    open_ones = [claim for claim in begun if not claim.has_ended]
-    assert len(open_ones) <= 2
-    assert all(claim.expired for claim in open_ones)
-    # Workers that claimed at the same moment may have left a gap.
-    trials = 1 + max(claim.trial.number for claim in begun)
+    trials = assert_those_under_way_can_be_resumed(tmp_path)
     sweep(f"sweep.trials={trials}").end()
     assert_every_trial_is_accounted_for_once(tmp_path, trials=trials)
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 @pytest.mark.parametrize("times", [1, 2])
 def test_ctrl_c_ends_a_sweep_whose_trials_would_take_minutes_to_end(sweep, tmp_path, times):
     (tmp_path / "slow.py").write_text(
@@ -157,7 +205,7 @@ def test_ctrl_c_ends_a_sweep_whose_trials_would_take_minutes_to_end(sweep, tmp_p
     assert not any(claim.has_ended for claim in claims(tmp_path))
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 def test_the_cars_of_a_killed_worker_are_gone_with_it(sweep):
     """A trial with processes of its own: they have another fork server, which has no other client."""
     long = ("sweep.trials=1", "budget.iterations=10000")
@@ -171,7 +219,7 @@ def test_the_cars_of_a_killed_worker_are_gone_with_it(sweep):
     assert not left
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 @pytest.mark.parametrize("seed", TIMES)
 def test_after_kill_9_of_everything_the_study_resumes(sweep, tmp_path, seed):
     running = sweep("sweep.workers=2", at_random=random.Random(seed))
@@ -183,7 +231,7 @@ def test_after_kill_9_of_everything_the_study_resumes(sweep, tmp_path, seed):
     assert_every_trial_is_accounted_for_once(tmp_path)
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 @pytest.mark.parametrize("seed", TIMES)
 def test_a_worker_that_wakes_up_after_its_lease_writes_neither_into_the_study_nor_into_the_run(
     sweep, tmp_path, seed
@@ -214,7 +262,7 @@ def test_a_worker_that_wakes_up_after_its_lease_writes_neither_into_the_study_no
     assert not (Path(held.trial.runs[0].run_dir) / "summary.json").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 @pytest.mark.parametrize("seed", TIMES)
 @pytest.mark.parametrize("is_killed", [True, False])
 def test_a_sweep_that_ends_in_its_last_stage_resumes_the_clone_and_no_trial(
@@ -276,7 +324,7 @@ def suspended(running):
     return None
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 @pytest.mark.parametrize("seed", TIMES)
 def test_two_drivers_share_one_study(sweep, tmp_path, seed):
     both = [sweep("sweep.workers=1"), sweep("sweep.workers=1")]
@@ -285,7 +333,7 @@ def test_two_drivers_share_one_study(sweep, tmp_path, seed):
     assert_every_trial_is_accounted_for_once(tmp_path)
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 @pytest.mark.parametrize("seed", TIMES)
 def test_while_the_database_is_away_all_wait_and_then_continue(sweep, tmp_path, postgres, seed):
     moment, url = random.Random(seed), postgres.new_database()

@@ -1,6 +1,7 @@
 """What a killed command leaves outside of its run folder is cleared away by the next one."""
 
 import contextlib
+import multiprocessing
 import os
 import random
 import shutil
@@ -16,7 +17,7 @@ import pytest
 from tests.conftest import IN_WORKERS, command
 from tests.waiting import wait_until
 
-pytestmark = pytest.mark.slow
+from .forked import begin, hold
 
 
 @pytest.fixture
@@ -30,6 +31,10 @@ def scratch():
 def left(scratch: Path) -> set[str]:
     """Return what lies there, without the one cache that PyTorch keeps for all processes."""
     return {one.name for one in scratch.iterdir() if not one.name.startswith("torchinductor_")}
+
+
+def lines(file: Path) -> list[str]:
+    return file.read_text(encoding="utf-8").splitlines()
 
 
 def is_over(process: psutil.Process) -> bool:
@@ -72,6 +77,29 @@ def another(tmp_path, scratch):
     return lambda: subprocess.run(command("--version"), **options, capture_output=True)
 
 
+@pytest.mark.usefixtures("workers_start_early")
+def test_what_a_killed_process_has_left_is_cleared_by_the_next_one(scratch):
+    def another() -> None:
+        process = multiprocessing.Process(target=begin, args=(scratch,))
+        process.start()
+        process.join()
+        assert process.exitcode == 0
+
+    killed = multiprocessing.Process(target=hold, args=(scratch,))
+    killed.start()
+    held = [
+        Path(line) for line in wait_until(lambda: (scratch / "held").exists() and lines(scratch / "held"))
+    ]
+    assert [file.exists() for file in held] == [True, True]
+    another()
+    assert [file.exists() for file in held] == [True, True]
+    killed.kill()
+    killed.join()
+    another()
+    assert [file.exists() for file in held] == [False, False]
+
+
+@pytest.mark.faults
 def test_the_next_command_clears_what_kill_9_has_left(start_one, another, scratch):
     training = start_one()
     training.wait_for_iterations(2)
@@ -90,6 +118,7 @@ def test_the_next_command_clears_what_kill_9_has_left(start_one, another, scratc
     training.assert_nothing_left()
 
 
+@pytest.mark.faults
 def test_it_clears_what_was_left_at_any_moment_of_a_start(start_one, another, scratch):
     moments = random.Random(5)
     for number in range(10):
@@ -104,6 +133,7 @@ def test_it_clears_what_was_left_at_any_moment_of_a_start(start_one, another, sc
         training.assert_nothing_left()
 
 
+@pytest.mark.faults
 def test_a_command_that_ends_leaves_nothing(start_one, scratch):
     training = start_one()
     training.wait_for_iterations(1)

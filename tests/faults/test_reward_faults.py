@@ -8,7 +8,6 @@ import pytest
 
 from deepracer_exp.runs.trace import read_trace
 from tests.conftest import IN_WORKERS
-from tests.training.conftest import workers_start_early  # noqa: F401 - a fixture
 
 DEAF = """
 import itertools

@@ -2,15 +2,14 @@
 
 import multiprocessing
 import signal
-import threading
 import time
 
 import psutil
 import pytest
 
 from tests.conftest import IN_WORKERS, iterations
-from tests.training.conftest import workers_start_early  # noqa: F401 - a fixture
-from tests.waiting import wait_until
+
+from .conftest import meanwhile
 
 DEATHS_ALONE = ("collector.hang_timeout_s=600",)
 """The watchdog would end a worker later than the tests wait: what ends the run is that the death is noticed."""
@@ -32,19 +31,18 @@ def test_a_killed_worker_never_ends_in_a_finished_run(call, tmp_path):
     killed = []
 
     def kill() -> None:
-        wait_until(lambda: iterations(tmp_path) >= 2, "second iteration")
         workers = [psutil.Process(one.pid) for one in multiprocessing.active_children()]
         killed.append(sorted(workers, key=lambda one: (one.create_time(), one.pid))[1])
         killed[0].kill()
 
-    threading.Thread(target=kill).start()
-    ended = call("train", *IN_WORKERS, *DEATHS_ALONE, "budget.env_steps=100000000")
+    with meanwhile(lambda: iterations(tmp_path) >= 2, kill):
+        ended = call("train", *IN_WORKERS, *DEATHS_ALONE, "budget.env_steps=100000000")
     ended.assert_run_failed("collector worker 1", f"(process {killed[0].pid})", "died by signal SIGKILL")
     assert ended.summary["iteration"] == len(ended.metrics) >= 2
     assert not multiprocessing.active_children()
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 def test_a_worker_that_stops_is_ended_and_named(start_training):
     training = start_training("collector=sync", *HANGS_SOON)
     training.wait_for_iterations(2)
@@ -52,14 +50,14 @@ def test_a_worker_that_stops_is_ended_and_named(start_training):
     _lost(training, "collector worker 0", "took no ")
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 def test_a_worker_killed_while_it_starts_ends_the_run(start_training):
     training = start_training("collector=sync", *DEATHS_ALONE)
     training.wait_for_worker().send_signal(signal.SIGKILL)
     _lost(training, "orker 0")
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 def test_a_worker_stopped_while_it_starts_ends_the_run(start_training):
     training = start_training(*HANGS_SOON)
     training.wait_for_worker().send_signal(signal.SIGSTOP)
@@ -68,7 +66,7 @@ def test_a_worker_stopped_while_it_starts_ends_the_run(start_training):
     training.assert_nothing_left()
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 @pytest.mark.parametrize(
     ("signum", "options", "words"),
     [(signal.SIGKILL, DEATHS_ALONE, "died by signal SIGKILL"), (signal.SIGSTOP, HANGS_SOON, "took no ")],
@@ -81,7 +79,7 @@ def test_a_worker_lost_while_the_learner_learns_ends_the_run(start_training, sig
     _lost(training, "collector worker 0", words)
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 @pytest.mark.parametrize("moment", ["start", "driving"])
 def test_workers_do_not_outlive_a_killed_training(start_training, moment):
     training = start_training("collector=sync")
@@ -97,7 +95,7 @@ def test_workers_do_not_outlive_a_killed_training(start_training, moment):
     assert not (ended.folder / "summary.json").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 def test_workers_that_hang_do_not_outlive_a_killed_training(start_training, tmp_path):
     (tmp_path / "deaf.py").write_text(
         "import itertools\ndef reward_function(params):\n    return all(itertools.repeat(True))\n"
@@ -111,7 +109,7 @@ def test_workers_that_hang_do_not_outlive_a_killed_training(start_training, tmp_
     training.assert_nothing_left()
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 def test_a_fork_server_that_is_killed_ends_the_run(start_training):
     training = start_training(*DEATHS_ALONE)
     training.wait_for_iterations(1)
@@ -119,7 +117,7 @@ def test_a_fork_server_that_is_killed_ends_the_run(start_training):
     _lost(training, "collector worker")
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 def test_a_run_stopped_as_a_whole_continues_afterwards(start_training):
     """Ctrl-Z and fg: no worker is to blame for the pause."""
     training = start_training(*HANGS_SOON, "budget.env_steps=null", "budget.iterations=40")

@@ -10,12 +10,14 @@ import optuna
 import pytest
 import sqlalchemy as sa
 
-from deepracer_exp.collectors.forking import start_workers_early
 from deepracer_exp.sweeps.queue.claims import TrialClaims
 from deepracer_exp.sweeps.queue.storage import resolve_database
+from tests.training.conftest import workers_start_early
 from tests.waiting import PATIENCE_S
 
 from .studies import season
+
+__all__ = ["workers_start_early"]
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
@@ -76,17 +78,8 @@ class Racers:
             process.join()
 
 
-@pytest.fixture(scope="session")
-def fork_server() -> Iterator[None]:
-    """Let processes fork from one that has imported what a sweep's worker needs, as the command does."""
-    before = multiprocessing.get_start_method(allow_none=True)
-    start_workers_early(True, "deepracer_exp.sweeps.queue.worker")
-    yield
-    multiprocessing.set_start_method(before, force=True)
-
-
 @pytest.fixture
-def race(tmp_path: Path, fork_server: None) -> Iterator[Callable[..., Racers]]:
+def race(tmp_path: Path, workers_start_early: None) -> Iterator[Callable[..., Racers]]:
     """Let each of some owners do the same in a process: `race(WHAT, URL, OWNERS, ARGUMENTS...)`."""
     started: list[Racers] = []
 

@@ -24,7 +24,7 @@ def runs_of(cwd):
 
 
 @pytest.fixture(scope="module")
-def cloned(tmp_path_factory, call_at, fork_server):
+def cloned(tmp_path_factory, call_at, workers_start_early):
     """Return a folder in which a study of two trials was made, and the best one cloned."""
     ended = call_at(tmp_path_factory.mktemp("cloned"), *TINY, "study=s", LR, "sweep.trials=2", CLONE)
     assert ended.code == 0, ended.stderr

@@ -12,7 +12,7 @@ from deepracer_exp.runs.run_files import read_config, read_object
 from deepracer_exp.sweeps.queue.storage import open_storage
 from deepracer_exp.sweeps.report.best_trial import best_line, best_run
 from deepracer_exp.sweeps.trial import Trial
-from tests.training.conftest import assert_same_run, workers_start_early  # noqa: F401 - a fixture
+from tests.training.conftest import assert_same_run
 
 TINY = (
     *("sweep", "experiment=tiny", "tracking=off", "collector.threads=1", "checkpoints.every=1"),
@@ -65,7 +65,7 @@ def test_a_study_that_is_not_there_is_refused_before_the_sweep_starts(call):
 
 
 @pytest.fixture(scope="module")
-def swept(tmp_path_factory, call_at, fork_server):
+def swept(tmp_path_factory, call_at, workers_start_early):
     """Return a folder in which a study of two trials was made."""
     folder = tmp_path_factory.mktemp("swept")
     ended = call_at(folder, *TINY, "study=s", LR, "sweep.trials=2")

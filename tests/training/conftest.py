@@ -28,8 +28,8 @@ def assert_same_run(one: Path, other: Path) -> None:
 
 @pytest.fixture(scope="session")
 def workers_start_early() -> Iterator[None]:
-    """Let workers fork from a process that has imported torch, as the command does: a second instead of five each."""
+    """Let workers, of sweeps too, fork from a process that has imported what they need, as commands do."""
     before = multiprocessing.get_start_method(allow_none=True)
-    start_workers_early(True)
+    start_workers_early(True, "deepracer_exp.collectors.car_worker", "deepracer_exp.sweeps.queue.worker")
     yield
     multiprocessing.set_start_method(before, force=True)
