@@ -2,51 +2,66 @@
 
 import importlib.util
 import json
+import multiprocessing
 import subprocess
 import sys
 from collections.abc import Sequence
+from multiprocessing import forkserver
 from pathlib import Path
 
+import pytest
+
 from deepracer_exp.collectors import car_worker
+from deepracer_exp.collectors.forking import start_workers_early
+from deepracer_exp.commands import train
 from deepracer_exp.sweeps.queue import worker
 
-# Run in a process that forks workers: prints what one of them has imported before it is told anything.
-FORKED = """
-import multiprocessing
-code = "import gc, json, sys; print(json.dumps([*sys.modules, gc.get_freeze_count()]))"
-multiprocessing.Process(target=exec, args=(code,)).start()
-"""
-
-
-def forked(done: subprocess.CompletedProcess[str]) -> tuple[set[str], int]:
-    """Return the modules of a worker and how many objects are left out of its garbage collection."""
-    *names, frozen = json.loads(done.stdout.splitlines()[-1])
-    return set(names), frozen
+from .training.conftest import workers_start_early  # noqa: F401 - a fixture
 
 
 # The server ignores a name that is none, and each worker would import for seconds while the training waits.
-def test_workers_are_forked_from_a_process_that_has_imported_and_compiled_what_they_need():
+def test_all_that_workers_are_to_be_forked_with_is_there(monkeypatch):
+    told: list[str] = []
+    monkeypatch.setattr(multiprocessing, "set_start_method", lambda *_, **__: None)
+    monkeypatch.setattr(multiprocessing, "set_forkserver_preload", told.extend)
+    monkeypatch.setattr(forkserver, "ensure_running", lambda: None)
+    start_workers_early(True)
+    assert car_worker.__name__ in told
+    start_workers_early(True, train._WORKER)
+    assert worker.__name__ in told
+    assert [name for name in told if importlib.util.find_spec(name) is None] == []
+
+
+@pytest.mark.usefixtures("workers_start_early")
+def test_a_worker_is_forked_from_a_process_that_has_imported_and_compiled_what_it_needs(tmp_path):
     code = f"""
-from deepracer_exp.collectors.forking import start_workers_early
-start_workers_early(True)
-{FORKED}"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    names, frozen = forked(done)
-    assert {car_worker.__name__, "deepracer_exp.collectors.fork_ready", "torchrl"} <= names
+import gc, json, pathlib, sys
+names, frozen = list(sys.modules), gc.get_freeze_count()
+pathlib.Path({str(tmp_path / "forked")!r}).write_text(json.dumps([names, frozen]))
+"""
+    forked = multiprocessing.Process(target=exec, args=(code,))
+    forked.start()
+    forked.join()
+    names, frozen = json.loads((tmp_path / "forked").read_text())
+    assert {car_worker.__name__, "deepracer_exp.collectors.fork_ready", "torchrl"} <= set(names)
     assert frozen > 0
 
 
 def test_a_sweep_starts_its_workers_before_it_imports_pytorch_or_pandas(tmp_path):
-    code = f"""
+    code = """
 import sys
+from multiprocessing import forkserver
 from deepracer_exp.cli import main
 from deepracer_exp.sweeps import run_sweep
 
+def show():
+    print({"torch", "pandas"} & sys.modules.keys(), flush=True)
+
 def run(driver, interruption):
-    print({{"torch", "pandas"}} & sys.modules.keys(), flush=True)
-    exec({FORKED!r})
+    show()
     return 130
 
+forkserver.ensure_running = show
 run_sweep.Driver.run = run
 main(["sweep", "experiment=tiny", "algorithm.lr=1e-3,1e-4", "tracking=off"])
 """
@@ -54,9 +69,7 @@ main(["sweep", "experiment=tiny", "algorithm.lr=1e-3,1e-4", "tracking=off"])
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.returncode == 130, done.stderr
-    assert done.stdout.splitlines()[0] == "set()"
-    names, _ = forked(done)
-    assert {worker.__name__, "torchrl"} <= names
+    assert done.stdout.splitlines() == ["set()", "set()"]
 
 
 def state_of_libraries(modules: Sequence[str], compared: Sequence[str] = ()) -> tuple[dict, dict]:
@@ -73,6 +86,7 @@ def state_of_libraries(modules: Sequence[str], compared: Sequence[str] = ()) -> 
     return functions, process
 
 
+@pytest.mark.slow
 def test_nothing_of_other_libraries_differs_from_a_process_without_this_package():
     ours = [
         f"deepracer_exp.{name}"

@@ -66,7 +66,7 @@ def python():
 def test_a_process_that_is_stopped_is_given_up(python):
     process = python("while True: pass")
     process.send_signal(signal.SIGSTOP)
-    silence = wait_patiently(lambda _: False, 1.0, lambda: use_of(process.pid))
+    silence = wait_patiently(lambda seconds: time.sleep(seconds), 0.3, lambda: use_of(process.pid))
     assert silence is not None
     assert silence.idle_s > silence.computed_s
 
@@ -77,7 +77,7 @@ def test_the_cpu_of_what_a_process_has_started_is_its_own(python):
     (child,) = wait_until(psutil.Process(process.pid).children, "child")
     try:
         # No interpreter needs so much for its start.
-        wait_until(lambda: use_of(process.pid).cpu_s > 3.0, "CPU of the child")
+        wait_until(lambda: use_of(process.pid).cpu_s > 1.5, "CPU of the child")
     finally:
         child.kill()
 
@@ -89,7 +89,7 @@ def test_nothing_is_counted_of_a_process_that_is_gone(python):
 
 
 def test_that_somebody_waits_is_no_work():
-    silence = wait_patiently(lambda seconds: time.sleep(seconds) or False, 1.5)
+    silence = wait_patiently(lambda seconds: time.sleep(seconds) or False, 0.4)
     assert silence is not None
     assert silence.idle_s > silence.computed_s
 
@@ -97,7 +97,7 @@ def test_that_somebody_waits_is_no_work():
 def test_a_thread_that_computes_is_waited_for_by_its_cpu():
     over = threading.Event()
     threading.Thread(target=lambda: all(not over.is_set() for _ in iter(int, 1)), daemon=True).start()
-    silence = wait_patiently(lambda seconds: over.wait(seconds), 1.5)
+    silence = wait_patiently(lambda seconds: over.wait(seconds), 0.4)
     over.set()
     assert silence is not None
     assert silence.computed_s > silence.idle_s

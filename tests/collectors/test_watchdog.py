@@ -30,7 +30,7 @@ def watch(tmp_path, monkeypatch, processes):
     monkeypatch.setattr(watchdog, "_START_TIMEOUT_S", 1.0)
     made = []
 
-    def make(timeout_s: float = 4.0) -> Watchdog:
+    def make(timeout_s: float = 2.0) -> Watchdog:
         made.append(Watchdog(tmp_path / "beats", 2, timeout_s))
         made[-1].workers_started(processes)
         return made[-1]
@@ -63,7 +63,7 @@ def test_a_worker_without_a_step_is_ended_and_the_other_lives(watch, beats, proc
     _keep_beating(counters, [1], dog)
     assert list(dog.verdict) == [0]
     assert "after 1 steps" in dog.verdict[0]
-    assert "collector.hang_timeout_s=4" in dog.verdict[0]
+    assert "collector.hang_timeout_s=2" in dog.verdict[0]
     assert "load average" in dog.verdict[0]
     processes[0].join(PATIENCE_S)
     assert processes[0].exitcode == -signal.SIGKILL
@@ -107,9 +107,9 @@ def test_a_worker_that_is_waited_for_is_named_now_and_then(watch, beats, monkeyp
 
 
 def test_no_worker_is_ended_while_none_is_waited_for(watch, beats, processes):
-    dog = watch()
-    beats()[:] = 1
+    dog = watch(0.1)
     dog.rest()
-    time.sleep(1.5)
+    beats()[:] = 1
+    time.sleep(0.3)
     assert not dog.verdict
     assert all(process.is_alive() for process in processes)

@@ -8,7 +8,7 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.env.setup import build_setup
 
-CARS, STEPS = 4, 30
+CARS, STEPS = 4, 14
 
 
 @pytest.fixture

@@ -128,7 +128,7 @@ def test_a_model_metadata_that_is_none_is_refused_with_its_name(train_here, tmp_
         ),
         ("import sys\nsys.exit(0)\ndef reward_function(params):\n    return 1.0\n", ["SystemExit", "line 2"]),
         ("1 / 0\ndef reward_function(params):\n    return 1.0\n", ["ZeroDivisionError", "line 1"]),
-        ("while True:\n    pass\ndef reward_function(params):\n    return 1.0\n", ["time limit of 1 s"]),
+        ("while True:\n    pass\ndef reward_function(params):\n    return 1.0\n", ["time limit of 0.2 s"]),
         ("reward_function = 3\n", ["reward_function is 3"]),
     ],
 )
@@ -136,7 +136,7 @@ def test_a_reward_file_that_is_none_is_refused_with_its_name(train_here, tmp_pat
     path = tmp_path / "my_reward.py"
     if text is not None:
         path.write_text(text)
-    train_here(f"reward.file={path}", "reward.time_limit_s=1").assert_bad_input("my_reward.py", *words)
+    train_here(f"reward.file={path}", "reward.time_limit_s=0.2").assert_bad_input("my_reward.py", *words)
 
 
 def test_a_folder_in_the_place_of_a_file_is_refused(train_here, tmp_path):

@@ -9,7 +9,7 @@ import pytest
 from tests.waiting import wait_until
 
 
-@pytest.mark.parametrize("size_kib", [150, 200, 300, 500])
+@pytest.mark.parametrize("size_kib", [150, 300, 500])
 def test_a_disk_that_fills_up_ends_the_run_with_one_line(train_here, mounted, size_kib):
     """With these sizes: in the first, in later iterations, while pictures are drawn."""
     folder = mounted(f"size={size_kib}k")
@@ -65,7 +65,7 @@ def test_paths_of_any_name_work(train_here, tmp_path):
     assert (summary.parent / "best_lap.png").is_file()
 
 
-@pytest.mark.parametrize("tracking", ["off", "mlflow"])
+@pytest.mark.parametrize("tracking", ["off", pytest.param("mlflow", marks=pytest.mark.faults)])
 def test_a_folder_that_vanishes_during_the_training_ends_the_run_with_one_line(
     train_here, tmp_path, tracking
 ):

@@ -19,7 +19,7 @@ def reward_function(params):
 """Never returns to the interpreter, which alone could raise an error; a loop that catches all may be left some time."""
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 @pytest.mark.parametrize("command", ["train", "sweep"])
 def test_a_reward_that_ends_a_worker_never_ends_a_command_with_0(run_at, tmp_path, command):
     (tmp_path / "leaves.py").write_text("import os\ndef reward_function(params):\n    os._exit(0)\n")
@@ -34,7 +34,7 @@ def test_a_reward_that_ends_a_worker_never_ends_a_command_with_0(run_at, tmp_pat
     assert not list(tmp_path.glob("runs/*/*/summary.json")) or ended.summary["status"] == "failed"
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 def test_workers_that_die_silently_are_reported_without_naming_an_empty_log(run_at, tmp_path):
     (tmp_path / "mine.py").write_text(
         "import multiprocessing, os\n"
@@ -65,12 +65,12 @@ def reward(tmp_path):
         ("return 1 / 0", ["raised ZeroDivisionError", "line 3 of"]),
         ("sys.exit(0)", ["raised SystemExit: 0", "line 3 of"]),
         ("return math.nan", ["returned nan"]),
-        ("while True: pass", ["took longer than the time limit of 1 s", "line 3 of"]),
+        ("while True: pass", ["took longer than the time limit of 0.2 s", "line 3 of"]),
     ],
 )
 def test_a_reward_that_is_none_ends_the_run_with_its_name_car_and_step(train_here, reward, line, words):
     """All that cannot be a reward is tested with the function itself."""
-    ended = train_here(reward(f"    {line}"), "reward.time_limit_s=1")
+    ended = train_here(reward(f"    {line}"), "reward.time_limit_s=0.2")
     ended.assert_run_failed("reward my_reward: reward_function", "car 0, step 2", *words)
     fault = json.loads((ended.folder / "faults" / "training.json").read_text())
     assert fault["message"] == ended.summary["reason"]
@@ -104,7 +104,7 @@ def test_a_reward_that_raises_in_a_worker_ends_the_run_with_the_workers_own_word
     assert not multiprocessing.active_children()
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 def test_a_reward_that_is_deaf_to_its_time_limit_is_ended_by_the_watchdog(start_training, tmp_path):
     path = tmp_path / "deaf.py"
     path.write_text(DEAF)

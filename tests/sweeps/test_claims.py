@@ -52,7 +52,7 @@ def test_the_next_owner_gets_what_a_late_one_recorded_and_no_later_write_of_that
 
 
 def test_a_lease_expires_by_itself_and_not_before(claims):
-    lease_s = 2.0
+    lease_s = 0.6
     late = claims.claim("late", 1, 0.0)
     assert claims.all()[0].expired
     assert claims.renew(late, HOUR_S, {"completion": 12.5}), "until another worker takes it over"

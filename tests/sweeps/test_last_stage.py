@@ -16,7 +16,7 @@ from deepracer_exp.tracking.resolve import resolve
 
 from .test_sweep_command import LR, TINY, load
 
-CLONE = "sweep.clone={randomization: sim2real, budget.iterations: 3}"
+CLONE = "sweep.clone={randomization: sim2real, budget.iterations: 2}"
 
 
 def runs_of(cwd):

@@ -22,8 +22,10 @@ from deepracer_exp.sweeps.queue.worker_config import Parent
 from deepracer_exp.sweeps.run_sweep import _conclude, _parent, _without_rules, begin_study_run
 from deepracer_exp.sweeps.search.space import SearchSpace
 from deepracer_exp.sweeps.trial import Interrupted, SeedRun, Trial
+from deepracer_exp.tracking import study_run
 from deepracer_exp.tracking.store import resolve_store
 from deepracer_exp.training.signals import Interruption
+from tests.tracking.conftest import ProjectorHere
 
 from .studies import add, new_study
 
@@ -87,15 +89,16 @@ def test_the_parent_is_resolved_when_a_study_is_begun_and_stays_the_same(trained
     assert _parent(compose_sweep(["study=p", LR]), None) is None
 
 
-def test_drivers_that_begin_at_once_share_one_run_in_mlflow(tmp_path):
+def test_drivers_that_begin_at_once_share_one_run_in_mlflow(monkeypatch, tmp_path):
+    monkeypatch.setattr(study_run, "Projector", ProjectorHere)
     request = compose_sweep(["study=spring", LR])
     space, store = SearchSpace.from_request(request), resolve_store(None, tmp_path)
 
     def begin(_):
         return begin_study_run(request, space, store, tmp_path)
 
-    with ThreadPoolExecutor(4) as drivers:
-        begun = list(drivers.map(begin, range(4)))
+    with ThreadPoolExecutor(3) as drivers:
+        begun = list(drivers.map(begin, range(3)))
     assert all(run.finish("FINISHED", 60) for run, _ in begun)
     client = MlflowClient(tracking_uri=store.uri)
     (found,) = client.search_runs([client.get_experiment_by_name("spring").experiment_id])

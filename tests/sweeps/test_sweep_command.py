@@ -16,7 +16,7 @@ from tests.training.conftest import assert_same_run
 
 TINY = (
     *("sweep", "experiment=tiny", "tracking=off", "collector.threads=1", "checkpoints.every=1"),
-    *("episode.max_steps=60", "budget.env_steps=null", "budget.iterations=4", "sweep.protocol=three_trials"),
+    *("episode.max_steps=60", "budget.env_steps=null", "budget.iterations=2", "sweep.protocol=three_trials"),
     *("sweep.workers=1", "sweep.rerank_laps=2", "trace=full"),
     "algorithm.frames_per_iteration=256",
 )

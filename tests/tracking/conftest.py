@@ -1,6 +1,9 @@
+import contextlib
+import io
 import json
 import os
 import queue
+import resource
 import shutil
 import signal
 import subprocess
@@ -9,6 +12,7 @@ import threading
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -16,7 +20,7 @@ from mlflow import MlflowClient
 
 from deepracer_exp.runs.checkpoint_files import write_hashes
 from deepracer_exp.runs.run_files import read_run_id
-from deepracer_exp.tracking import project, projector
+from deepracer_exp.tracking import download, project, projector
 from deepracer_exp.tracking.mlflow_metrics import metric_name, now_ms
 from deepracer_exp.tracking.mlflow_run import MLflowRun
 from deepracer_exp.tracking.registry import Registered, promote
@@ -137,6 +141,35 @@ def points(client: MlflowClient, run_id: str | None, column: str = "completion")
     """Return step and value of each point that a run has of a column of metrics.jsonl."""
     history = client.get_metric_history(run_id, metric_name(column))
     return sorted((point.step, point.value) for point in history)
+
+
+@pytest.fixture
+def downloads_here(monkeypatch):
+    """Let the process that downloads be a call in this one: importing MLflow takes it seconds, each time."""
+
+    @contextlib.contextmanager
+    def running(command, **_):
+        def communicate(wanted: bytes, _: float):
+            said = io.StringIO()
+            monkeypatch.setattr(sys, "argv", command[-2:])
+            monkeypatch.setattr(sys, "stdin", io.StringIO(wanted.decode()))
+            with contextlib.redirect_stderr(said):
+                process.returncode = download._main()
+            return None, said.getvalue().encode()
+
+        process = SimpleNamespace(communicate=communicate, pid=os.getpid())
+        yield process
+
+    monkeypatch.setattr(download, "running", running)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.fixture
+def projector_here(monkeypatch) -> None:
+    """Let the process that records runs be a thread of this one."""
+    monkeypatch.setattr(projector, "Projector", ProjectorHere)
 
 
 @pytest.fixture

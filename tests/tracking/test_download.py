@@ -1,21 +1,14 @@
 """A promoted model where the folder of its run is not."""
 
-import contextlib
-import io
 import json
-import os
-import resource
 import shutil
-import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.checkpoint_files import verify
-from deepracer_exp.tracking import download as module
 from deepracer_exp.tracking.calls import StoreRefusedError
 from deepracer_exp.tracking.download import Download, download
 from deepracer_exp.tracking.registry import look_up
@@ -33,29 +26,6 @@ def away(season, client) -> Path:
         client.log_artifact(run_id, str(run / name))
     shutil.rmtree(run)
     return run
-
-
-@pytest.fixture
-def downloads_here(monkeypatch):
-    """Let the process that downloads be a call in this one: importing MLflow takes it seconds, each time."""
-
-    @contextlib.contextmanager
-    def running(command, **_):
-        def communicate(wanted: bytes, _: float):
-            said = io.StringIO()
-            monkeypatch.setattr(sys, "argv", command[-2:])
-            monkeypatch.setattr(sys, "stdin", io.StringIO(wanted.decode()))
-            with contextlib.redirect_stderr(said):
-                process.returncode = module._main()
-            return None, said.getvalue().encode()
-
-        process = SimpleNamespace(communicate=communicate, pid=os.getpid())
-        yield process
-
-    monkeypatch.setattr(module, "running", running)
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 def files_of(client) -> Path:
@@ -117,6 +87,7 @@ def test_files_that_are_not_the_registered_ones_are_refused_and_leave_nothing(
     assert not list(away.parent.iterdir())
 
 
+@pytest.mark.usefixtures("downloads_here")
 def test_a_registry_of_gigabytes_fills_no_disk(away, season, client, tmp_path):
     with (files_of(client) / "agent" / "state.tdz").open("wb") as file:
         file.truncate(10**8)
@@ -157,6 +128,7 @@ def test_a_server_has_the_files_itself_and_a_database_has_them_in_a_folder(store
     store.files_at(place)
 
 
+@pytest.mark.usefixtures("downloads_here")
 def test_what_killed_downloads_have_left_is_removed_by_the_next_one(away, season, client):
     left = away.parent / ".download-left"
     left.mkdir(parents=True)

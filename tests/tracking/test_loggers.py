@@ -127,6 +127,7 @@ def test_a_missing_package_is_one_line_that_names_the_extra(call, kind, monkeypa
     ended.assert_bad_input(f"tracking={kind}", f"pip install 'deepracer-exp[{kind}]'")
 
 
+@pytest.mark.usefixtures("projector_here")
 def test_a_training_writes_its_curves_for_tensorboard(call):
     pytest.importorskip("tensorboard")
     ended = call("train", *IN_PROCESS, "tracking=tensorboard", "budget.iterations=1")

@@ -24,7 +24,7 @@ from deepracer_exp.tracking.tracking_file import (
 from tests.conftest import IN_PROCESS
 from tests.waiting import wait_until
 
-from .conftest import TrackerHere, begin, points, write_rows
+from .conftest import ProjectorHere, TrackerHere, begin, points, write_rows
 
 MODULE = "deepracer_exp.tracking.project"
 
@@ -57,6 +57,7 @@ def test_a_lost_process_is_replaced_and_nothing_is_recorded_twice(store, mlflow,
     assert points(mlflow, read_run_id(tmp_path), "kl") == [(100, 0.5), (200, 0.25)]
 
 
+@pytest.mark.faults
 def test_the_next_run_has_the_same_process_and_one_that_hangs_does_not(store, mlflow, kept, tmp_path):
     pids = []
     for number in range(3):
@@ -94,6 +95,7 @@ time.sleep(600)
         wait_until(lambda: not any(child.is_running() for child in children), "end of the process")
 
 
+@pytest.mark.slow
 def test_a_training_that_mlflow_records_does_not_import_it(tmp_path):
     words = [word for word in IN_PROCESS if not word.startswith("tracking")]
     code = f"""
@@ -152,10 +154,10 @@ def test_a_run_whose_folder_cannot_be_read_says_so_at_its_end(store, tmp_path):
     assert "metrics.jsonl" in str(tracker.failure)
 
 
-def test_an_end_that_changes_afterwards_is_recorded_without_its_files_again(store, mlflow, kept, tmp_path):
+def test_an_end_that_changes_afterwards_is_recorded_without_its_files_again(store, mlflow, tmp_path):
     run = TrackedRun("run", "race", 1234, store=store.shown)
     (tmp_path / "config.yaml").write_text("checkpoints: {every: 5}\n")
-    recorded = projector.ProjectedRun(tmp_path, run, store, kept)
+    recorded = projector.ProjectedRun(tmp_path, run, store, ProjectorHere())
     recorded.begin(is_training=True)
     recorded.change(status="FINISHED", end_ms=now_ms())
     assert recorded.wait_for_end(60) is None

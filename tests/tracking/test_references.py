@@ -123,6 +123,7 @@ def test_the_folder_of_a_registered_run_may_move_with_all_runs(season, client, t
     assert resolve("champion", moved, None).path == moved / "season" / "1"
 
 
+@pytest.mark.usefixtures("downloads_here")
 def test_a_checkpoint_that_is_not_the_registered_one_is_refused(season, client):
     run = season.champion(client)
     checkpoint = run / "checkpoints" / "000020"

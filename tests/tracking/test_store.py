@@ -40,9 +40,10 @@ def test_a_path_that_sqlite_uris_cannot_name_is_bad_input(tmp_path):
         resolve_store(None, tmp_path / "why?")
 
 
-def test_neither_a_uri_that_is_checked_nor_tracking_off_imports_mlflow(tmp_path):
+def test_neither_a_uri_that_is_checked_nor_a_training_s_tracker_imports_mlflow(tmp_path):
     code = (
-        "import sys; from pathlib import Path; from deepracer_exp.config.running import TrackingOff\n"
+        "import sys; from pathlib import Path; from deepracer_exp.config.running import MLflowTracking, TrackingOff\n"
+        "from deepracer_exp.tracking.projector import Projector\n"
         "from deepracer_exp.tracking.tracker import open_tracker\n"
         "from deepracer_exp.tracking.tracking_file import TrackedRun\n"
         "from deepracer_exp.tracking.store import resolve_store\n"
@@ -51,6 +52,12 @@ def test_neither_a_uri_that_is_checked_nor_tracking_off_imports_mlflow(tmp_path)
         "tracker.open(Path('no'), TrackedRun('run', 'race', 1))\n"
         "tracker.log({'kl': 1.0}, 1); tracker.set_tag('a', 'b'); tracker.finish('FINISHED')\n"
         "assert tracker.failure is tracker.outage is None\n"
+        "Projector.send = lambda self, line: None\n"
+        f"folder = Path({str(tmp_path)!r})\n"
+        "tracker = open_tracker(MLflowTracking(kind='mlflow', uri=None), folder)\n"
+        "tracker.open(folder, TrackedRun('run', 'race', 1))\n"
+        "tracker.log({'kl': 1.0}, 1); tracker.set_tag('a', 'b'); tracker.finish('FINISHED', 0.01)\n"
+        "assert tracker.failure is not None\n"
         "assert not {name for name in sys.modules if name.startswith(('mlflow', 'torch'))}"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -77,9 +84,11 @@ def test_a_store_is_the_one_that_a_run_names_by_whichever_path_and_after_a_move(
 
 
 @pytest.fixture
-def recorded(tmp_path):
+def recorded(empty_database, tmp_path):
     """Return the folder of a project with a run that has a file, and the run."""
     project = tmp_path / "before"
+    project.mkdir()
+    shutil.copy(empty_database, project / "mlflow.db")
     run = MLflowRun(resolve_store(None, project))
     run.open(TrackedRun("run", "race", 1_000))
     (tmp_path / "file.txt").write_text("first", encoding="utf-8")
