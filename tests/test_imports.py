@@ -108,8 +108,11 @@ def test_nothing_of_other_libraries_differs_from_a_process_without_this_package(
     assert process == process_without
 
 
+@pytest.mark.usefixtures("workers_start_early")
 def test_pytorch_compiles_and_numba_keeps_code_of_others_where_it_would_without_this_package(tmp_path):
-    code = """
+    code = f"""
+import sys
+sys.path.insert(0, {str(tmp_path)!r})
 import deepracer_exp.training.run
 import deepracer_exp.collectors.car_worker
 import torch, users
@@ -119,5 +122,8 @@ assert users.doubled(2.0) == 4.0
     (tmp_path / "users.py").write_text(
         "from numba import njit\n\n@njit(cache=True)\ndef doubled(x):\n    return 2 * x\n"
     )
-    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True)
+    forked = multiprocessing.Process(target=exec, args=(code,))
+    forked.start()
+    forked.join()
+    assert forked.exitcode == 0
     assert list((tmp_path / "__pycache__").glob("users.doubled-*.nbi"))
