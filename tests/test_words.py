@@ -3,6 +3,7 @@
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 PRODUCT = Path(__file__).parents[1] / "deepracer_exp"
@@ -13,6 +14,11 @@ FRAGMENT = re.compile(r"(Of|Likewise|As for|The same|That of|Those of|It|Its|The
 DIALECT = re.compile(
     r"\b(pays?|whoever|somebody|nobody|anew|goes on|what came of)\b|\bas of `", re.IGNORECASE
 )
+
+
+@cache
+def parsed(file: Path) -> ast.Module:
+    return ast.parse(file.read_text())
 
 
 def names_in(tree: ast.AST) -> Iterator[str]:
@@ -38,18 +44,18 @@ def docstrings_in(tree: ast.AST) -> Iterator[str]:
 
 def test_a_name_says_what_it_holds():
     for file in PRODUCT.rglob("*.py"):
-        vague = {name for name in names_in(ast.parse(file.read_text())) if name.strip("_") in VAGUE}
+        vague = {name for name in names_in(parsed(file)) if name.strip("_") in VAGUE}
         # The number 1 beside the number 0 of compiled code.
         assert vague <= ({"one"} if file.name == "inner_loop.py" else set()), file
 
 
 def test_a_docstring_names_its_subject():
     for file in PRODUCT.rglob("*.py"):
-        fragments = [text for text in docstrings_in(ast.parse(file.read_text())) if FRAGMENT.match(text)]
+        fragments = [text for text in docstrings_in(parsed(file)) if FRAGMENT.match(text)]
         assert not fragments, file
 
 
 def test_a_docstring_speaks_the_fields_language():
     for file in [*PRODUCT.rglob("*.py"), *REWARD_ZOO.glob("*.py")]:
-        dialect = [text for text in docstrings_in(ast.parse(file.read_text())) if DIALECT.search(text)]
+        dialect = [text for text in docstrings_in(parsed(file)) if DIALECT.search(text)]
         assert not dialect, file

@@ -1,14 +1,21 @@
 """Runs of several seeds that were never driven: configuration, metrics and results."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
 
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.runs.run_files import RunRecord, read_record
+
+
+@cache
+def _config(overrides: tuple[str, ...]) -> Mapping[str, Any]:
+    return compose_experiment(overrides)[1].mapping
 
 
 def made_up_run(
@@ -19,7 +26,9 @@ def made_up_run(
     **more: object,
 ) -> RunRecord:
     """Write a run that is evaluated every 1,000 steps and falls to `lap_s`, a second an evaluation; None: no lap."""
-    config = compose_experiment(overrides)[1].mapping
+    seeds = [int(word.removeprefix("seed=")) for word in overrides if word.startswith("seed=")]
+    config = {**_config(tuple(word for word in overrides if not word.startswith("seed=")))}
+    config |= {"seed": seeds[-1]} if seeds else {}
     rows = []
     for number in range(1, 2 * evaluations + 1):
         row = {"iteration": number, "env_steps": 500 * number, "wall_clock_s": 1.0 * number, "laps": number}
@@ -35,7 +44,7 @@ def made_up_run(
     best = {"iteration": 2 * evaluations, "metric": "race_score", "rank": rank, **more}
     best |= {key: last[key] for key in last if key.startswith(("eval_", "held_out"))}
     folder.mkdir(parents=True)
-    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    (folder / "config.yaml").write_text(yaml.dump(config, Dumper=yaml.CSafeDumper))
     (folder / "overrides.yaml").write_text(yaml.safe_dump(list(overrides)))
     (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     summary = {"status": "finished", "reason": "done", "iteration": len(rows), "best": best}

@@ -28,13 +28,13 @@ def alone(records: list[RunRecord]) -> list[tuple[None, RunRecord]]:
     return [(None, record) for record in records]
 
 
-@pytest.fixture
-def two(tmp_path: Path) -> list[RunGroup]:
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> list[RunGroup]:
     """Two groups of five seeds on two tracks; the second is faster by far on both."""
-    records = []
+    records, folder = [], tmp_path_factory.mktemp("two")
     for track, length in (("reinvent_base", 1.0), ("Oval_track", 2.0)):
         for words, lap_s in ((["algorithm.lr=1e-4"], 9.0), (["algorithm.lr=1e-3"], 8.0)):
-            records += made_up_seeds(tmp_path, [f"track={track}", *words], length * lap_s)
+            records += made_up_seeds(folder, [f"track={track}", *words], length * lap_s)
     return group_runs(alone(records))
 
 

@@ -14,7 +14,7 @@ from deepracer_exp.tracking.resolve import resolve
 @pytest.fixture
 def runs(copied, monkeypatch):
     """Return two equal runs of one experiment, of which the later one is the best, in the folder's `runs`."""
-    first = copied("checkpoints.every=1")
+    first = copied()
     monkeypatch.chdir(first.parents[2])
     later = first.with_name(first.name.replace(first.name[:15], "20990101-000000"))
     shutil.copytree(first, later, symlinks=True)

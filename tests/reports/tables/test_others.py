@@ -30,11 +30,12 @@ MIXED = (
     *("race=head_to_bot", "race.boxes.number=2", "observation.next_objects=2"),
     "track=reInvent2019_track",
 )
+QUICK = ("evaluation.trials=1", "evaluation.time_s=5", "evaluation.held_out=null")
 
 
 @pytest.fixture(scope="module")
 def mixed(trained):
-    return prepare(read_run_recording(trained(*MIXED).folder))
+    return prepare(read_run_recording(trained(*MIXED, *QUICK).folder))
 
 
 def test_every_crash_of_a_run_has_the_box_or_bot_that_the_car_is_in(mixed):
@@ -142,7 +143,7 @@ def test_a_log_whose_parameters_say_where_the_boxes_are_is_analysed_as_a_run_amo
         "race.boxes.positions=[{lap: 0.3, lane: inner}, {lap: 0.6, lane: outer}]",
         "track=reInvent2019_track",
     )
-    run = read_run_recording(trained(*fixed).folder)
+    run = read_run_recording(trained(*fixed, *QUICK).folder)
     own = prepare(run)
     logged = dataclasses.replace(run.recording, race={"OBJECT_POSITIONS": "0.3,1;0.6,-1"})
     view = prepare(logged)
@@ -168,7 +169,7 @@ def test_each_crash_of_a_recorded_training_is_one_with_its_bot(reference, tmp_pa
 
 def test_a_report_of_a_race_head_to_head_shows_the_rival_and_the_boxes(trained):
     options = ("race=head_to_head", "race.boxes.number=2", "observation.next_objects=2", "reward=overtake")
-    view = prepare(read_run_recording(trained(*options, "track=reInvent2019_track").folder))
+    view = prepare(read_run_recording(trained(*options, "track=reInvent2019_track", *QUICK).folder))
     others = view.others
     assert others.names == ("box 1", "box 2", "rival")
     ended = view.steps.iloc[others.crashes["row"]]

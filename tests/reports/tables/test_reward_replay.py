@@ -24,6 +24,7 @@ from tests.conftest import IN_PROCESS, call_in
 from .conftest import CONSOLE
 from .made_up import Drive, made_up_recording, typed
 
+QUICK = ("evaluation.trials=1", "evaluation.time_s=5", "evaluation.held_out=null")
 FOLLOW = """
 def reward_function(params):
     share = params["distance_from_center"] / params["track_width"]
@@ -38,8 +39,7 @@ def replay_reward(view: LogView, reward: str, **more) -> ReplayedRewards:
 
 @pytest.fixture(scope="module")
 def own(trained) -> LogView:
-    run = trained("algorithm.frames_per_iteration=2048", "budget.env_steps=8192").folder
-    return prepare(read_run_recording(run))
+    return prepare(read_run_recording(trained("reward=progress_delta", "budget.iterations=2").folder))
 
 
 @pytest.fixture
@@ -68,13 +68,13 @@ def test_the_services_own_reward_is_paid_again_in_all_rows_and_in_the_evaluation
 
 
 @pytest.mark.parametrize(
-    "overrides", [(), ("track=Bowtie_track", "track.direction=alternate"), ("reward=progress_delta",)]
+    "overrides", [(), ("track=Bowtie_track", "track.direction=alternate", "reward=progress_delta")]
 )
 def test_a_runs_own_reward_is_paid_again_in_every_row(tmp_path, monkeypatch, overrides):
     # Without the rounding of traces, whose effect the test below measures.
     monkeypatch.setattr(trace, "_STORED", SCHEMA)
     monkeypatch.setattr(trace, "_ENCODINGS", {})
-    run = call_in(tmp_path, "train", *IN_PROCESS, *overrides, "budget.iterations=2").folder
+    run = call_in(tmp_path, "train", *IN_PROCESS, *QUICK, *overrides, "budget.iterations=2").folder
     source = named_reward_source(str(run / "reward_function.py"))
     car = parse_experiment(read_config(run)).car
     replayed = reward_replay.replay_reward(prepare(read_run_recording(run)), source, car)
@@ -83,9 +83,8 @@ def test_a_runs_own_reward_is_paid_again_in_every_row(tmp_path, monkeypatch, ove
     assert set(replayed.waypoints["reversed"]) == both
 
 
-def test_the_decimals_of_a_trace_are_enough_to_pay_a_reward_again(trained):
-    run = trained("reward=progress_delta", "budget.iterations=2").folder
-    replayed = replay_reward(prepare(read_run_recording(run)), "progress_delta")
+def test_the_decimals_of_a_trace_are_enough_to_pay_a_reward_again(own):
+    replayed = replay_reward(own, "progress_delta")
     # A step's gain is known to 1e-6% of a lap of 17.7 m, the recorded reward to seven digits.
     np.testing.assert_allclose(replayed.steps["new_reward"], replayed.steps["reward"], rtol=1e-6, atol=4e-7)
 
@@ -160,6 +159,11 @@ def laps_of(times: dict[int, int], back: tuple[int, ...] = ()) -> LogView:
     return replace(prepare(replace(made_up_recording([Drive()]), steps=steps)), course=circle())
 
 
+@pytest.fixture(scope="module")
+def fifty_steps() -> LogView:
+    return laps_of({0: 50})
+
+
 def test_laps_are_ranked_by_the_new_reward(reward):
     # Paid a lap, not a step: the fastest ranks first.
     once = "def reward_function(p):\n    return 10000 / p['steps'] ** 2 if p['progress'] == 100 else 0\n"
@@ -221,9 +225,9 @@ def test_rows_without_a_position_have_no_reward_and_those_without_a_course_are_r
     ],
 )
 @pytest.mark.filterwarnings("ignore:divide by zero")
-def test_a_function_that_fails_is_reported_with_episode_and_step(reward, text, words):
+def test_a_function_that_fails_is_reported_with_episode_and_step(fifty_steps, reward, text, words):
     with pytest.raises(BadInput, match=words) as error:
-        replay_reward(laps_of({0: 50}), reward(text), time_limit_s=0.5)
+        replay_reward(fifty_steps, reward(text), time_limit_s=0.5)
     assert "\n" not in str(error.value)
 
 
@@ -234,5 +238,5 @@ def test_steps_are_paid_at_once_without_sharing_one_limit(reward):
         "    until = time.thread_time() + 1e-4 * len(p['x'])\n"
         "    while time.thread_time() < until: pass\n    return p['x'] * 0.0 + 1.0\n"
     )
-    replayed = replay_reward(laps_of({0: 10_000}), reward(text), time_limit_s=0.8)
-    assert replayed.steps["new_reward"].sum() > 9_000
+    replayed = replay_reward(laps_of({0: 5_000}), reward(text), time_limit_s=0.4)
+    assert replayed.steps["new_reward"].sum() > 4_500

@@ -103,7 +103,7 @@ def scatter(rng: np.random.Generator, count: int, memory: float) -> np.ndarray:
 def test_at_most_one_of_twenty_histories_without_a_change_is_reported(
     column: str, count: int, memory: float, learns: bool
 ) -> None:
-    rng, histories = np.random.default_rng(count), 80
+    rng, histories = np.random.default_rng(count), 40
     curve = 6.0 * (1 + 0.4 * learns * np.exp(-np.arange(count) / 3))
     reported = [
         slower_laps(table(curve + 0.15 * scatter(rng, count, memory), np.linspace(200, 280, count), column))
