@@ -1,8 +1,10 @@
 """The two lanes of courses, in which boxes stand and bots drive, and to which cars are put back."""
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from functools import wraps
+from typing import NamedTuple, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +21,20 @@ _TIE_M, _NEARBY_M = 1e-3, 1.0
 """Distances that count as equal, and largest shift along the lap of the projection of a lane's point."""
 
 Floats = NDArray[np.float64]
+Result = TypeVar("Result")
+
+
+def _once_per_track(find: Callable[[Track], Result]) -> Callable[[Track], Result]:
+    """Keep the result with its track: both lanes take 20 ms, and a validation among others needs them 100 times."""
+    results: WeakKeyDictionary[Track, Result] = WeakKeyDictionary()
+
+    @wraps(find)
+    def kept(track: Track) -> Result:
+        if track not in results:
+            results[track] = find(track)
+        return results[track]
+
+    return kept
 
 
 class Paths(NamedTuple):
@@ -46,13 +62,9 @@ class Lanes:
     def __init__(self, tracks: Sequence[Track]):
         """Set up the lanes of the courses; the index of a course is its index in `tracks`."""
         self._tracks = tracks
-        lanes = [
-            [(track.waypoints + track.inner) / 2 for track in tracks],
-            [(track.waypoints + track.outer) / 2 for track in tracks],
-        ]
-        self._points = lanes
+        of_tracks = [_lines(track) for track in tracks]
         self._lines: Segments = segments.join_segments(
-            [build_segments(points) for lane in lanes for points in lane]
+            [lines[lane] for lane in (INNER, OUTER) for lines in of_tracks]
         )
 
     def poses(self, points: Floats, lane: NDArray[np.int64], track_index: TrackIndex) -> Pose:
@@ -71,13 +83,9 @@ class Lanes:
         A path is a periodic cubic spline through the lane's points over the distances of their projections on the
         centre line (deepracer-simapp, track_geom/spline/track_spline.py).
         """
-        cells = []
-        rows: list[list[Floats]] = [[], []]
-        for place, track in enumerate(self._tracks):
-            count = math.ceil(track.length_m / _CELL_M)
-            cells.append(count)
-            for lane in (INNER, OUTER):
-                rows[lane].append(_path(track, self._points[lane][place], count))
+        of_tracks = [_path_rows(track) for track in self._tracks]
+        rows = [[paths[lane] for paths in of_tracks] for lane in (INNER, OUTER)]
+        cells = [len(path) - 1 for path in rows[INNER]]
         sizes = np.array(cells) + 1
         return Paths(
             np.stack([np.concatenate(lane) for lane in rows]),
@@ -85,6 +93,26 @@ class Lanes:
             np.array(cells),
             np.array([track.length_m for track in self._tracks]),
         )
+
+
+def _points(track: Track) -> tuple[Floats, Floats]:
+    """Return the points of the inner and of the outer lane of a course, (n, 2) each."""
+    return (track.waypoints + track.inner) / 2, (track.waypoints + track.outer) / 2
+
+
+@_once_per_track
+def _lines(track: Track) -> tuple[Segments, Segments]:
+    """Return both lanes of a course."""
+    inner, outer = _points(track)
+    return build_segments(inner), build_segments(outer)
+
+
+@_once_per_track
+def _path_rows(track: Track) -> tuple[Floats, Floats]:
+    """Return the rows of `Paths` for both lanes of a course."""
+    inner, outer = _points(track)
+    cells = math.ceil(track.length_m / _CELL_M)
+    return _path(track, inner, cells), _path(track, outer, cells)
 
 
 def _path(track: Track, points: Floats, cells: int) -> Floats:
