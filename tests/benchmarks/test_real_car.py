@@ -10,6 +10,7 @@ import torch
 
 from benchmarks import real_car
 from deepracer_exp.commands.export.car_converter import has_openvino
+from tests.commands.export.test_car_archive import SHORT
 from tests.conftest import Ended
 
 
@@ -61,9 +62,7 @@ def test_each_seed_is_trained_whole_and_without(
 def test_a_run_is_measured_under_each_condition(
     monkeypatch: pytest.MonkeyPatch, trained: Callable[..., Ended]
 ) -> None:
-    camera = ("observation=camera", "collector.cars=4", "algorithm.frames_per_iteration=64")
-    short = ("algorithm.batch_size=64", "algorithm.epochs=1", "budget.env_steps=64", "checkpoints.every=null")
-    run = trained(*camera, *short).folder
+    run = trained(*SHORT).folder
     asked = real_car.protocols()
     shorter = {name: replace(config, time_s=0.5, trials=1) for name, config in asked.items()}
     monkeypatch.setattr(real_car, "protocols", lambda: shorter)
