@@ -135,7 +135,8 @@ def test_lists_from_a_lap_need_one_track_and_a_number_of_actions(override, words
 
 def test_a_training_takes_them(run_dir, call, train_here):
     assert call("actions", str(run_dir), "--name", "mine").code == 0
-    ended = train_here("action_space=mine", "budget.iterations=1", "name=next")
+    quick = ("budget.iterations=1", "evaluation.trials=1", "evaluation.time_s=2", "evaluation.held_out=null")
+    ended = train_here("action_space=mine", "name=next", *quick)
     assert ended.code == 0, ended.stderr
 
 

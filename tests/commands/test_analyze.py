@@ -13,6 +13,12 @@ from deepracer_exp.runs import recording as run_recording
 from tests.aws.made_up_logs import drives, log_text
 from tests.page_html import Html
 
+QUICK = (
+    "budget.iterations=1",
+    "evaluation.trials=1",
+    "evaluation.time_s=2",
+    "evaluation.held_out=null",
+)
 LAPS = ("track=Straight_track", "action_space=deepracer", "reward=progress_delta", "budget.env_steps=16384")
 
 
@@ -84,19 +90,17 @@ def test_several_trainings_in_a_folder_are_named(call, tmp_path):
     assert "trainings in it" not in call("analyze", "both").stdout
 
 
-def test_a_target_has_its_chance(run_dir, call):
-    ended = call("analyze", str(run_dir), "--target", "1000", "--output", "page.html")
-    assert ended.code == 0, ended.stderr
-    assert "1000.00 s" in ended.stdout
-
-
-def test_another_reward_function_is_replayed_and_the_page_opened(run_dir, call, tmp_path, monkeypatch):
+def test_another_reward_function_is_replayed_a_target_has_its_chance_and_the_page_is_opened(
+    run_dir, call, tmp_path, monkeypatch
+):
     opened: list[str] = []
     monkeypatch.setattr(webbrowser, "open", lambda address: opened.append(address) or True)
     (tmp_path / "mine.py").write_text("def reward_function(params):\n    return float(params['speed'])\n")
-    ended = call("analyze", str(run_dir), "--reward", "mine.py", "--open", "--output", "page.html")
+    asked = ("--reward", "mine.py", "--target", "1000", "--open", "--output", "page.html")
+    ended = call("analyze", str(run_dir), *asked)
     assert ended.code == 0, ended.stderr
     assert "mine" in ended.stdout
+    assert "1000.00 s" in ended.stdout
     assert "Under another reward function" in findings_told(tmp_path / "page.html")
     assert opened == [(tmp_path / "page.html").resolve().as_uri()]
 
@@ -117,8 +121,9 @@ def test_code_from_elsewhere_is_not_run(run_dir, call, tmp_path):
     ("asked", "has_page"), [((), False), (("-o", "page.html"), True), (("--target", "9"), True)]
 )
 def test_laps_are_written_without_the_page_unless_that_is_asked_for_too(
-    run_dir, call, tmp_path, asked, has_page
+    run_dir, call, tmp_path, monkeypatch, asked, has_page
 ):
+    monkeypatch.setattr(log_report, "html", lambda page: page.view.name)  # drawing one takes a second
     pages = [run_dir / "report.html", tmp_path / "page.html"]
     pages[0].unlink(missing_ok=True)
     ended = call("analyze", str(run_dir), "--replay", "laps.html", *asked)
@@ -172,7 +177,7 @@ def test_a_training_ends_with_its_page_which_stands_in_its_mlflow_run_too(call):
 
     from deepracer_exp.runs.run_files import read_run_id
 
-    tiny = ("experiment=tiny", "collector=in_process", "collector.threads=1", "budget.iterations=1")
+    tiny = ("experiment=tiny", "collector=in_process", "collector.threads=1", *QUICK)
     ended = call("train", *tiny, "report=true")
     assert ended.code == 0, ended.stderr
     assert "report.html" in ended.stdout
@@ -189,7 +194,7 @@ def test_a_fault_of_the_page_is_reported_and_leaves_the_training_finished(train_
         raise ZeroDivisionError("a bug\nof two lines")
 
     monkeypatch.setattr(log_report, "write_log_page", fault)
-    ended = train_here("report=true", "budget.iterations=1")
+    ended = train_here("report=true", *QUICK)
     assert ended.code == 0
     assert ended.summary["status"] == "finished"
     (line,) = [line for line in ended.stderr.splitlines() if line.startswith("warning: ")]
@@ -206,7 +211,7 @@ def test_a_second_signal_during_the_page_leaves_it_off_and_the_training_finished
         raise KeyboardInterrupt
 
     monkeypatch.setattr(log_report, "write_log_page", interrupted)
-    ended = train_here("report=true", "budget.iterations=1")
+    ended = train_here("report=true", *QUICK)
     assert (ended.code, ended.summary["status"]) == (0, "finished")
     assert "report.html was left off; `deepracer-exp analyze " in ended.stderr
 

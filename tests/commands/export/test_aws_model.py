@@ -13,6 +13,7 @@ from deepracer_exp.agents.actor_critic import build_actor_critic
 from deepracer_exp.agents.service_weights import VALUE, to_service
 from deepracer_exp.aws.models.model_metadata import NEURAL_NETWORKS, ModelMetadata, read_model_metadata
 from deepracer_exp.aws.models.tf_checkpoint import read_index, read_tensors
+from deepracer_exp.commands.export import aws_model as exporting
 from deepracer_exp.commands.export.aws_model import aws_model, services_kind
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.custom_files.model_files import sensor_overrides
@@ -68,7 +69,7 @@ def test_the_files_are_those_that_the_service_wants():
 
 def test_a_value_network_of_features_is_replaced_and_the_note_says_so():
     networks, files, notes = written(
-        *("observation=camera", "network=deep", "network.critic=features", "track.direction=reversed")
+        *("observation=camera", "network=shallow", "network.critic=features", "track.direction=reversed")
     )
     assert any(note.startswith("value network: ") for note in notes)
     index = next(content for name, content in files.items() if name.endswith(".index"))
@@ -81,10 +82,9 @@ def test_a_value_network_of_features_is_replaced_and_the_note_says_so():
 
 @pytest.mark.parametrize(("direction", "is_clockwise"), [("forward", False), ("reversed", True)])
 def test_an_open_course_is_clockwise_against_its_waypoints(direction, is_clockwise):
-    _, files, _ = written(
-        *("observation=camera", "network=shallow", "track=Straight_track", f"track.direction={direction}")
-    )
-    assert yaml.safe_load(files["training_params.yaml"])["TRACK_DIRECTION_CLOCKWISE"] is is_clockwise
+    experiment, _ = compose_experiment(["track=Straight_track", f"track.direction={direction}"])
+    params, _ = exporting._training_params(experiment)
+    assert yaml.safe_load(params)["TRACK_DIRECTION_CLOCKWISE"] is is_clockwise
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,6 @@ from tests.commands.export.test_car_archive import LEFT, SHORT, exported, unpack
 KINDS = [
     ("experiment=real_car",),
     ("observation=camera", "action_space=discrete"),
-    ("experiment=real_car", "network=shallow", *LEFT),
     ("observation=camera", "algorithm=sac", "action_space=continuous", *LEFT),
 ]
 

@@ -73,12 +73,10 @@ def programmed(default: Written, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     "overrides",
     [
-        ("action_space=discrete", "network=mlp_small"),
         ("action_space=grid", "network=mlp_small_shared", "network.activation=silu"),
         ("action_space=continuous", "network=mlp_small", "network.activation=tanh"),
-        ("action_space=continuous", "network=mlp_small_shared", "network.activation=elu"),
-        ("action_space=continuous", "algorithm=sac"),
-        ("action_space=discrete", "algorithm=sac"),
+        ("action_space=continuous", "algorithm=sac", "network.activation=elu"),
+        ("action_space=discrete", "algorithm=sac", "network=mlp_small"),
     ],
     ids=" ".join,
 )
