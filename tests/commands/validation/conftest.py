@@ -1,13 +1,14 @@
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from deepracer_exp.commands.validation import reward_map
+from deepracer_exp.commands.validation import reward_map, simple_driver
 from deepracer_exp.commands.validation import validate as checking
 from deepracer_exp.commands.validation.objects import with_others
-from deepracer_exp.commands.validation.simple_driver import DrivenLap, action_space_laps
+from deepracer_exp.commands.validation.simple_driver import DrivenLap, SimpleDriver, action_space_laps
 from deepracer_exp.commands.validation.validate import Check, look_closer, read, try_named_situations
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.driving import RewardConfig
@@ -50,15 +51,26 @@ def race_with(race: RaceSetup, tmp_path: Path) -> Callable[..., RaceSetup]:
     return build
 
 
+@pytest.fixture(scope="session")
+def driven() -> dict[tuple[Any, ...], list[DrivenLap | None]]:
+    """Laps that were driven, by all that they depend on: hardly any reward function has others than the next."""
+    return {}
+
+
 @pytest.fixture
-def coarsely(laps: list[DrivenLap], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sample fewer situations than the command does, and drive the laps once."""
+def coarsely(driven: dict[tuple[Any, ...], list[DrivenLap | None]], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sample fewer situations than the command does, and drive the same laps once."""
+    drive = simple_driver.drive_laps
 
-    def driven(setup: RaceSetup) -> list[DrivenLap]:
-        same = (setup.track.name, setup.track.reversed, setup.actions.n) == ("reinvent_base", False, 15)
-        return laps if same and setup.others is None else action_space_laps(setup)
+    def drive_once(setup: RaceSetup, drivers: Sequence[SimpleDriver]) -> list[DrivenLap | None]:
+        track, low, high = setup.track, tuple(setup.actions.low), tuple(setup.actions.high)
+        on = (track.name, track.reversed, track.length_m, low, high, repr(setup.car), repr(setup.others))
+        key = (*on, setup.seed, tuple(drivers))
+        if key not in driven:
+            driven[key] = drive(setup, drivers)
+        return driven[key]
 
-    monkeypatch.setattr(checking, "action_space_laps", driven)
+    monkeypatch.setattr(simple_driver, "drive_laps", drive_once)
     monkeypatch.setattr(checking, "_DETAILS", ((float("inf"), 0.2),))
     monkeypatch.setattr(checking, "_SAMPLES", ((float("inf"), 400),))
     monkeypatch.setattr(reward_map, "_DOTS_PER_INCH", 40)

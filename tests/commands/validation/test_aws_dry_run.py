@@ -4,14 +4,13 @@ from deepracer_exp.commands.validation.aws_dry_run import dry_run_findings, vali
 from deepracer_exp.commands.validation.aws_rules import text_findings
 
 ACCEPTED = [
-    *("1.0", "float(params['steps'])", "np.float64(2.0)", "params['x']", "params['track_width']", "-1e5"),
-    *("float(np.sum(params['waypoints']) > 0)", "float(len(params['objects_location']) == 6)"),
+    *("np.float64(2.0)", "params['x']", "-1e5"),
+    "float(params['steps'] + np.sum(params['waypoints']) > 0) + float(len(params['objects_location']) == 6)",
 ]
 REFUSED = [
     ("1", "line 5 returned 1 of type int; accepted: a float from -100000 to 100000"),
     ("params['progress'] > 50", "of type bool"),
     ("np.float32(1)", "of type float32"),
-    ("params['progress']", "returned 0 of type int"),
     (
         "params['speed']",
         "returned 1 of type int; accepted: a float from -100000 to 100000, called off the track",
@@ -21,7 +20,6 @@ REFUSED = [
     ("params['steps'] / params['progress']", "raised ZeroDivisionError: division by zero in line 5 of"),
     ("1.0 if params['waypoints'] else 0.1", "raised ValueError: The truth value of an array"),
     ("float(params['waypoints'].index((0, 0)))", "raised AttributeError"),
-    ("params['sim_time']", "raised KeyError: 'sim_time'"),
     ("params['projection_distance']", "raised KeyError"),
     ("params['objects_distance_from_center'][0]", "raised KeyError"),
 ]
@@ -68,9 +66,7 @@ def test_an_import_is_refused_where_it_is_executed_while_the_function_is_called(
     assert findings(function("1.0", body.format("> 1"))) == []
 
 
-@pytest.mark.parametrize(
-    "expression", ["{}.sum()", "{}.all()", "{}.max()", "np.average({})", "np.clip(1.0, {}, 2.0)[0]"]
-)
+@pytest.mark.parametrize("expression", ["{}.sum()", "np.average({})", "np.clip(1.0, {}, 2.0)[0]"])
 def test_methods_of_arrays_that_import_a_module_in_the_validator_are_found(findings, expression):
     text = function(f"float({expression.format('a')})", "a = np.ones(3)\n    ")
     (found,) = findings(text)
@@ -88,9 +84,10 @@ def test_a_method_that_the_text_defines_is_no_array_s(findings):
     assert findings(head + function("lap.max()")) == []
 
 
-@pytest.mark.parametrize("name", ["sum", "all", "max", "mean", "std", "linalg.norm", "argmin"])
-def test_functions_of_numpy_are_accepted(findings, name):
-    assert findings(function(f"float(np.{name}(a))", "a = np.ones(3)\n    ")) == []
+def test_functions_of_numpy_are_accepted(findings):
+    names = ("sum", "all", "max", "mean", "std", "linalg.norm", "argmin")
+    called = " + ".join(f"np.{name}(a)" for name in names)
+    assert findings(function(f"float({called})", "a = np.ones(3)\n    ")) == []
 
 
 @pytest.mark.parametrize("value", ["5", "None", "max"])
