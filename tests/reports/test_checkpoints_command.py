@@ -11,7 +11,7 @@ import pytest
 from deepracer_exp.runs.checkpoint_files import HASHES, pin, write_hashes
 from tests.page_html import Html
 
-QUICK = ("evaluation.trials=2", "evaluation.held_out=aws", "evaluation.time_s=20")
+QUICK = ("evaluation.trials=2", "evaluation.held_out=aws", "evaluation.time_s=8")
 
 
 @pytest.fixture

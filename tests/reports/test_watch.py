@@ -108,12 +108,11 @@ def test_a_network_that_reads_one_of_two_cameras_looks_through_that_alone():
     "overrides",
     [
         ("observation=camera_small",),
-        ("observation=camera_small", "action_space=continuous"),
-        (),
+        ("action_space=continuous",),
         ("observation=lidar", "observation.lidar.kind=discretized", "observation.lidar.reach_m=12"),
         ("observation=camera_lidar",),
     ],
-    ids=["pictures", "continuous", "features", "lidar", "pictures and lidar"],
+    ids=["pictures", "continuous", "lidar", "pictures and lidar"],
 )
 def test_a_film_has_thirty_frames_a_second_and_shows_another_picture_in_each(circle, protocol, overrides):
     experiment = compose_experiment([f"track.file={circle}", *overrides])[0]
