@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
+from unittest import mock
 
 import psutil
 import pytest
@@ -336,11 +337,26 @@ def refused(call: Callable[..., object], *arguments: object, **options: object) 
 IN_PROCESS = ("experiment=tiny", "tracking=off", "collector=in_process", "collector.threads=1")
 IN_WORKERS = ("experiment=tiny", "tracking=off", "collector=sync", "collector.processes=2")
 
+OFTEN = (
+    *("episode.max_steps=60", "evaluation.time_s=4", "evaluation.trials=1", "checkpoints.every=2"),
+    *("collector.cars=8", "algorithm.frames_per_iteration=256", "algorithm.batch_size=128"),
+)
+"""Episodes end often, sooner than with a lap, and evaluations come soon."""
+THREE = ("budget.env_steps=null", "budget.iterations=3")
+RACE = ("race=head_to_head", "observation.next_objects=1")
+POOL = (*RACE, "race.rivals.policy=pool", "race.rivals.snapshot_every=1", "race.rivals.pool_size=3")
 
-def call_in(cwd: Path, *arguments: str) -> Ended:
-    """Call `deepracer-exp ARGUMENTS` in this process with `cwd` as the working folder."""
+
+def call_in(cwd: Path, *arguments: str, pictures: bool = False) -> Ended:
+    """Call `deepracer-exp ARGUMENTS` in this process with `cwd` as the working folder.
+
+    A training draws its pictures if they are asked for only: they take as long as all the rest of a tiny one.
+    """
     out, err = io.StringIO(), io.StringIO()
+    trains = arguments[:1] in (("train",), ("resume",), ("clone",))
+    drawn = "deepracer_exp.reports.pages.run_page.write_pictures"
     with (
+        mock.patch(drawn) if trains and not pictures else contextlib.nullcontext(),
         contextlib.chdir(cwd),
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
@@ -415,6 +431,31 @@ def copied(trained: Callable[..., Ended], tmp_path: Path) -> Callable[..., Path]
         return shutil.copytree(ended.folder, tmp_path / "runs" / "tiny" / ended.folder.name, symlinks=True)
 
     return copy
+
+
+@pytest.fixture(scope="session")
+def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A database of MLflow with tables and no runs; creating the tables takes a second or two each time."""
+    from deepracer_exp.tracking.mlflow_run import MLflowRun
+    from deepracer_exp.tracking.store import resolve_store
+
+    runs = tmp_path_factory.mktemp("template")
+    MLflowRun(resolve_store(None, runs))
+    return runs / "mlflow.db"
+
+
+@pytest.fixture
+def mlflow_here(tmp_path: Path, empty_database: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Let trainings record below `runs/` in a thread of this process; return a client of their store."""
+    from mlflow import MlflowClient
+
+    from tests.tracking.conftest import ProjectorHere
+
+    for module in ("projector", "tracker"):
+        monkeypatch.setattr(f"deepracer_exp.tracking.{module}.Projector", ProjectorHere)
+    (tmp_path / "runs").mkdir(exist_ok=True)
+    database = shutil.copy(empty_database, tmp_path / "runs" / "mlflow.db")
+    return MlflowClient(tracking_uri=f"sqlite:///{database}")
 
 
 @pytest.fixture

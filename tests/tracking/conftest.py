@@ -22,7 +22,6 @@ from deepracer_exp.runs.checkpoint_files import write_hashes
 from deepracer_exp.runs.run_files import read_run_id
 from deepracer_exp.tracking import download, project, projector
 from deepracer_exp.tracking.mlflow_metrics import metric_name, now_ms
-from deepracer_exp.tracking.mlflow_run import MLflowRun
 from deepracer_exp.tracking.registry import Registered, promote
 from deepracer_exp.tracking.store import Store, resolve_store
 from deepracer_exp.tracking.tracker import ProjectedTracker, Tracker
@@ -69,14 +68,6 @@ class TrackerHere(ProjectedTracker):
     @property
     def run_id(self) -> str | None:
         return read_run_id(self._folder)
-
-
-@pytest.fixture(scope="session")
-def empty_database(tmp_path_factory) -> Path:
-    """A database with tables and no runs; creating the tables takes a second or two each time."""
-    runs = tmp_path_factory.mktemp("template")
-    MLflowRun(resolve_store(None, runs))
-    return runs / "mlflow.db"
 
 
 @pytest.fixture

@@ -18,6 +18,7 @@ from deepracer_exp.reports.tables.log_tables import headline
 from deepracer_exp.reports.tables.log_view import prepare
 from deepracer_exp.runs.recording import read_run_recording
 from deepracer_exp.training.stopping.stopping_rules import build_rule
+from tests.conftest import OFTEN, THREE
 from tests.waiting import wait_until
 
 NOT_LEARNING = (
@@ -53,12 +54,12 @@ def test_a_budgets_alerts_go_to_the_log_and_the_command(trained, tmp_path):
     command = tmp_path / "alert.sh"
     command.write_text('#!/bin/sh\necho "$1" >> alerts.txt\n')
     command.chmod(0o755)
-    ended = trained(f"budget.alert_command={command}")
+    ended = trained(*OFTEN, "budget.env_steps=1024", f"budget.alert_command={command}")
     # Commands run beside the training and each other.
     sent = sorted((ended.cwd / "alerts.txt").read_text().splitlines())
     assert sent == [
-        "100% of budget.env_steps used: 4,096 steps of 4,096 steps",
-        "50% of budget.env_steps used: 2,048 steps of 4,096 steps",
+        "100% of budget.env_steps used: 1,024 steps of 1,024 steps",
+        "50% of budget.env_steps used: 512 steps of 1,024 steps",
     ]
     log = (ended.folder / "log.txt").read_text()
     assert all(message in log for message in sent)
@@ -79,9 +80,9 @@ def ctrl_c_after(iterations, folder) -> None:
 def test_wherever_a_run_ends_its_last_policy_is_evaluated_and_all_name_the_same_best_one(
     train_here, call, tmp_path, end
 ):
-    own = ("checkpoints.every=50", "stopping=none")
+    own = (*OFTEN, "checkpoints.every=50", "stopping=none")
     if end == "budget":
-        ended = train_here(*own, "budget.iterations=3")
+        ended = train_here(*own, *THREE)
     else:
         threading.Thread(target=ctrl_c_after, args=(3, tmp_path)).start()
         ended = train_here(*own, "budget.env_steps=100000000")
@@ -119,12 +120,18 @@ def test_the_lines_to_paste_after_a_training_work(trained, copied, call):
             assert call(*line[1:]).code == 0, line
 
 
-def test_a_run_has_pictures_as_soon_as_it_has_an_iteration(trained, tmp_path):
+@pytest.mark.parametrize(
+    "overrides",
+    [(), ("track=[reinvent_base,Oval_track]", "race=object_avoidance")],
+    ids=" ".join,
+)
+def test_a_run_has_pictures_as_soon_as_it_has_an_iteration(train_here, tmp_path, overrides):
     write_pictures(tmp_path, build_courses(compose_experiment([])[0]))
     assert not list(tmp_path.iterdir())
-    folder = trained("budget.iterations=1").folder  # without a lap
+    ended = train_here("budget.iterations=1", *overrides, pictures=True)  # without a lap
+    assert ended.code == 0, ended.stderr
     for name in ("best_lap.png", "learning.png"):
-        assert (folder / name).read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
+        assert (ended.folder / name).read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
 
 
 def test_the_page_counts_the_episodes_that_the_summary_counts(trained):

@@ -15,6 +15,7 @@ from deepracer_exp.runs.run_result import Ending
 from deepracer_exp.runs.trace import read_trace
 from deepracer_exp.training.plan import plan_training
 from deepracer_exp.training.run import run_training
+from tests.conftest import OFTEN, THREE
 
 from .conftest import assert_same_run
 
@@ -79,16 +80,18 @@ def differences(one, other) -> tuple[str | None, ...]:
 
 
 def test_the_same_seed_gives_the_same_run_whatever_the_number_of_physics_threads(trained):
-    assert differences(trained(*OVERRIDES), trained(*OVERRIDES, "collector.threads=2")) == (None,) * 3
+    short = (*OFTEN, *THREE)
+    assert differences(trained(*short), trained(*short, "collector.threads=2")) == (None,) * 3
 
 
 def test_another_seed_gives_another_run(trained):
-    assert all(differences(trained(*OVERRIDES), trained(*OVERRIDES, "seed=1")))
+    short = (*OFTEN, *THREE)
+    assert all(differences(trained(*short), trained(*short, "seed=1")))
 
 
 @pytest.mark.usefixtures("workers_start_early")
 def test_the_same_seed_gives_the_same_run_in_one_process_and_in_several(call, tmp_path):
-    command = ("train", "experiment=tiny", "tracking=off", *OVERRIDES, "budget.env_steps=2048")
+    command = ("train", "experiment=tiny", "tracking=off", *OFTEN, "budget.env_steps=512")
     folders = []
     for name, where in (("alone", "mode=in_process"), ("two", "processes=2"), ("four", "processes=4")):
         ended = call(*command, f"name={name}", f"collector.{where}")
@@ -97,7 +100,7 @@ def test_the_same_seed_gives_the_same_run_in_one_process_and_in_several(call, tm
     for folder in folders[1:]:
         assert_same_run(folders[0], folder)
     assert len(read_metrics(folders[0] / "metrics.jsonl")) == 2
-    assert len(read_trace(folders[0] / "trace", ["steps"])) == 2048
+    assert len(read_trace(folders[0] / "trace", ["steps"])) == 512
 
 
 @pytest.mark.parametrize(
@@ -143,8 +146,6 @@ def test_several_tracks_train_together_and_each_has_its_metrics(trained):
             assert row[f"completion/{name}"] == (pytest.approx(here.progress.mean()) if len(here) else None)
     counted = ends.groupby("track", observed=True).size()
     assert {name: of["episodes"] for name, of in ended.summary["tracks"].items()} == dict(counted)
-    for name in ("best_lap.png", "learning.png"):
-        assert (ended.folder / name).exists()
     label = "reinvent_base_Oval_track_Straight_track-speed_on_track-seed0"
     assert ended.folder.name.split("-", 2)[2] == label
     with_laps = ends[ends.episode_status == "lap_complete"].track.nunique()
