@@ -25,7 +25,7 @@ DOCS = Path(__file__).parents[1] / "docs"
 OWN = (
     *("network=my_network:ResidualNet", "network.kwargs.width=16"),
     *("algorithm=my_algorithm:DecayedPPO", "algorithm.kwargs.decay=1e-3"),
-    *("algorithm.frames_per_iteration=1024", "algorithm.batch_size=256"),
+    *("algorithm.frames_per_iteration=256", "algorithm.batch_size=128", "budget.env_steps=1024"),
     *("lr_schedule=my_schedule:Triangle", "lr_schedule.kwargs.period=4"),
     "observation=my_features:SideForce",
     *("stopping=my_rule:LapUnder", "stopping.kwargs.seconds=1.0"),
@@ -102,7 +102,7 @@ def test_a_run_stores_names_of_classes_and_no_code(run):
 
 @pytest.mark.parametrize("command", ["resume", "clone", "evaluate", "watch", "export"])
 def test_a_stored_run_imports_no_code_by_itself(run, command):
-    extra = {"resume": ["budget.env_steps=8192"], "export": ["format=onnx"]}.get(command, [])
+    extra = {"resume": ["budget.env_steps=2048"], "export": ["format=onnx"]}.get(command, [])
     ended = call_in(at_home(run), command, run.name, *extra)
     ended.assert_refused("named by a stored run, which imports no code by itself", ".target=my_")
     assert not [name for name in sys.modules if name.startswith("my_")]
@@ -122,7 +122,7 @@ def test_the_lines_to_paste_name_the_classes_again(run, tmp_path):
         acting._named.clear()
         command, *words = shlex.split(line)[1:]
         if "--video" not in words:  # needs a renderer
-            extra = SHORT if command == "evaluate" else ("budget.env_steps=1024",) * (command == "clone")
+            extra = SHORT if command == "evaluate" else ("budget.env_steps=256",) * (command == "clone")
             ended = call_in(home, command, *words, *extra)
             assert ended.code == 0, (line, ended.stderr)
 
@@ -136,9 +136,9 @@ def test_a_line_to_paste_runs_nothing_that_the_run_has_written_into_it():
 def test_a_resumed_run_of_own_classes_equals_an_uninterrupted_one(run, tmp_path):
     write_examples(tmp_path)
     options = (*IN_PROCESS, *OWN, "tracking=my_tracker:JsonTracker")
-    half = call_in(tmp_path, "train", *options, "budget.env_steps=2048").folder
+    half = call_in(tmp_path, "train", *options, "budget.env_steps=512").folder
     acting._named.clear()
-    ended = call_in(tmp_path, "resume", half.name, *NAMED, "budget.env_steps=4096")
+    ended = call_in(tmp_path, "resume", half.name, *NAMED, "budget.env_steps=1024")
     assert ended.code == 0, ended.stderr
     pd.testing.assert_frame_equal(metrics(half), metrics(run))
     pd.testing.assert_frame_equal(curves(half), curves(run))

@@ -13,10 +13,11 @@ from deepracer_exp.training.plan import plan_resume, plan_training
 from deepracer_exp.training.run import copy_run, run_training
 from deepracer_exp.training.train_result import TakenOver
 from deepracer_exp.training.trainer import Callback
+from tests.conftest import IN_PROCESS, OFTEN
 
 from .conftest import assert_same_run
 
-TINY = ("experiment=tiny", "tracking=off", "collector=in_process", "checkpoints.every=2")
+TINY = (*IN_PROCESS, *OFTEN, "budget.env_steps=null", "budget.iterations=4")
 
 
 class At(Callback):
@@ -62,11 +63,11 @@ class MadeUpLaps(Callback):
 
 
 def test_the_fastest_reliable_checkpoint_is_kept_whatever_is_the_best(tmp_path):
-    often = ("checkpoints.every=1", "checkpoints.keep=1", "evaluation.time_s=4", "budget.env_steps=3072")
+    often = ("checkpoints.every=1", "checkpoints.keep=1", "budget.iterations=3")
     outcome = run(tmp_path, MadeUpLaps(), *often)
     link = outcome.folder / "checkpoints" / "fastest"
     assert link.readlink().name == "000002"
-    plan = plan_resume(outcome.folder, ["budget.env_steps=4096"])
+    plan = plan_resume(outcome.folder, ["budget.iterations=4"])
     assert run_training(plan, callbacks=[MadeUpLaps()]).status == "finished"
     assert link.readlink().name == "000002"
     lap = fastest_reliable(read_metrics(outcome.folder / "metrics.jsonl"))
@@ -100,9 +101,9 @@ def test_a_copy_continues_as_the_run_would_have_while_its_folder_is_held(tmp_pat
     holder.release()
 
 
-def test_a_copy_of_a_copy_is_another_run_of_mlflow_and_has_one_attempt_in_its_name(tmp_path):
+def test_a_copy_of_a_copy_is_another_run_of_mlflow_and_has_one_attempt_in_its_name(tmp_path, mlflow_here):
     one = ("tracking=mlflow", "budget.iterations=1")
-    first = run(tmp_path, None, *one, run_name="trial 3", tags={"sweep.trial": "3"}).folder
+    first = run(tmp_path / "runs", None, *one, run_name="trial 3", tags={"sweep.trial": "3"}).folder
     before = json.loads((first / "tracking.json").read_text())
     assert read_run_id(first)
     assert (before["run_name"], before["tags"]["sweep.trial"]) == ("trial 3", "3")

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from mlflow import MlflowClient
 from torchrl.checkpoint import Checkpoint
 
 from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, pinned
@@ -15,8 +14,7 @@ from deepracer_exp.runs.checkpoints import State
 from deepracer_exp.runs.run_files import read_config, read_object
 from deepracer_exp.runs.stored_run import StoredRun
 from deepracer_exp.training.clone import plan_clone
-
-OFTEN = ("episode.max_steps=60", "checkpoints.every=2", "budget.env_steps=null", "budget.iterations=3")
+from tests.conftest import OFTEN, THREE
 
 
 def config(folder) -> dict:
@@ -36,7 +34,7 @@ def agent_of(folder, name: str) -> dict:
 
 @pytest.fixture
 def parent(copied):
-    return copied(*OFTEN)
+    return copied(*OFTEN, *THREE)
 
 
 def child_of(parent, ended):
@@ -104,9 +102,9 @@ def test_a_copy_without_links_is_cloned_and_evaluated_from_the_same_checkpoint(p
 
 
 @pytest.mark.parametrize(("override", "lr"), [("algorithm.lr=3e-4", 3e-4), ("algorithm=ppo", 1.3e-3)])
-def test_a_rate_that_is_given_is_taken(parent, call, override, lr):
-    child = child_of(parent, call("clone", parent.name, "budget.iterations=1", override))
-    assert config(child)["algorithm"]["lr"] == pytest.approx(lr)
+def test_a_rate_that_is_given_is_taken(parent, override, lr):
+    plan = plan_clone(StoredRun(parent).with_checkpoint(), ["budget.iterations=1", override])
+    assert plan.experiment.algorithm.lr == pytest.approx(lr)
 
 
 @pytest.mark.parametrize(
@@ -141,16 +139,15 @@ def test_another_track_or_reward_is_allowed_and_warned_of(parent, call):
     assert config(child)["algorithm"]["lr"] == pytest.approx(1.3e-4)
 
 
-def test_in_mlflow_a_clone_stands_under_its_parent(call, tmp_path):
-    quick = ("experiment=tiny", "collector=in_process", "collector.threads=1", *OFTEN)
+def test_in_mlflow_a_clone_stands_under_its_parent(call, mlflow_here):
+    quick = ("experiment=tiny", "collector=in_process", "collector.threads=1", *OFTEN, *THREE)
     ended = call("train", *quick)
     assert ended.code == 0, ended.stderr
     parent = ended.folder
     child = child_of(parent, call("clone", parent.name, "budget.iterations=1"))
-    client = MlflowClient(tracking_uri=f"sqlite:///{tmp_path / 'runs' / 'mlflow.db'}")
     ids = [json.loads((folder / "mlflow.json").read_text())["run_id"] for folder in (parent, child)]
-    tags = client.get_run(ids[1]).data.tags
+    tags = mlflow_here.get_run(ids[1]).data.tags
     assert tags["mlflow.parentRunId"] == ids[0]
     assert tags["lineage.parent"] == parent.name
     assert tags["lineage.generation"] == "1"
-    assert "mlflow.parentRunId" not in client.get_run(ids[0]).data.tags
+    assert "mlflow.parentRunId" not in mlflow_here.get_run(ids[0]).data.tags

@@ -8,27 +8,23 @@ import signal
 import pytest
 import torch
 import yaml
-from mlflow import MlflowClient
 
 from deepracer_exp.agents.ppo import PPO
+from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.runs.checkpoints import check, checkpoint_name, read_checkpoint, read_training
 from deepracer_exp.runs.folder import RunFolder
 from deepracer_exp.runs.run_files import read_metrics, read_object
 from deepracer_exp.tracking.resolve import resolve
 from deepracer_exp.training import signals
+from deepracer_exp.training.plan import plan_training
+from deepracer_exp.training.run import run_training
+from deepracer_exp.training.train_result import TakenOver
 from deepracer_exp.training.trainer import Trainer
-from tests.conftest import IN_PROCESS
+from tests.conftest import IN_PROCESS, OFTEN, POOL, THREE
 from tests.waiting import wait_until
 
 from .conftest import assert_same_run
-
-# Reached sooner than a lap: episodes end often, and evaluations soon.
-OFTEN = (
-    *("episode.max_steps=60", "evaluation.time_s=4", "checkpoints.every=2"),
-    "algorithm.frames_per_iteration=512",
-)
-THREE = ("budget.env_steps=null", "budget.iterations=3")
 
 # Ends a run after three iterations.
 SOON = ("stopping=plateau", *(f"stopping.{one}" for one in ("window=1", "warmup=2", "patience=2", "gain=1")))
@@ -62,22 +58,14 @@ def whole(trained, *overrides):
         ("action_space=continuous", "randomization=sim2real", "network=mlp_small_shared"),
         (
             *("track=[reinvent_base,Oval_track]", "track.Oval_track.direction=alternate"),
-            *("lr_schedule=adaptive_kl", "checkpoints.every=null", "reward=speed_on_track"),
+            *("lr_schedule=adaptive_kl", "reward=speed_on_track"),
         ),
         (
-            *("observation=camera_small", "observation.camera.frames=2", "randomization=sim2real"),
-            *("collector.cars=4", "algorithm.batch_size=64", "algorithm.frames_per_iteration=128"),
+            *("observation=camera_lidar", "network.filters=[4,4,4]"),
+            *("randomization=real_car", "action_space.steering_angle.high=20", "collector.cars=2"),
+            *("algorithm.frames_per_iteration=32", "algorithm.batch_size=16", "checkpoints.every=null"),
         ),
-        ("observation=lidar", "randomization=sim2real"),
-        (
-            *("observation=camera", "randomization=real_car", "collector.cars=4", "algorithm.batch_size=64"),
-            *("algorithm.frames_per_iteration=256", "algorithm.epochs=1"),
-            *("checkpoints.every=null", "action_space.steering_angle.high=20"),
-        ),
-        (
-            *("race=head_to_head", "observation.next_objects=1", "race.rivals.policy=pool"),
-            *("race.rivals.snapshot_every=1", "race.rivals.pool_size=3"),
-        ),
+        POOL,
     ],
     ids=lambda overrides: " ".join(overrides) or "as it is",
 )
@@ -195,21 +183,27 @@ def test_a_resumed_run_that_fails_says_so_in_one_line(cut, call, monkeypatch):
     assert "Traceback" in (run / "log.txt").read_text()
 
 
-def test_a_run_killed_as_soon_as_it_is_one_begins_again_and_is_recorded_once(trained, start, call, tmp_path):
-    killed = start("train", *IN_PROCESS, *OFTEN, *THREE)
-    (config,) = killed.wait_for(lambda: list(tmp_path.glob("runs/*/*/config.yaml")), "run")
-    killed.popen.kill()
-    killed.popen.wait()
-    killed.assert_nothing_left()  # the command's process outlives the one that started it by a moment
+def test_a_run_killed_as_soon_as_it_is_one_begins_again_and_is_recorded_once(
+    trained, call, mlflow_here, tmp_path, monkeypatch
+):
+    def killed(self, interruption):
+        raise TakenOver  # from here on nothing is written, as after a kill
+
+    composed = compose_experiment([*IN_PROCESS, *OFTEN, *THREE, f"runs_dir={tmp_path / 'runs'}"])
+    with monkeypatch.context() as patched:
+        patched.setattr(Trainer, "fit", killed)
+        with pytest.raises(TakenOver):
+            run_training(plan_training(*composed))
+    (config,) = tmp_path.glob("runs/*/*/config.yaml")
     run = config.parent
     assert not (run / "tracking.json").exists()
+    assert not (run / "summary.json").exists()
     ended = call("resume", run.name, "tracking=mlflow")
     assert ended.code == 0, ended.stderr
     assert f"{run.name}: had no checkpoint yet: begins again" in ended.stderr
     assert_same_run(run, trained(*OFTEN, *THREE).folder)
-    client = MlflowClient(tracking_uri=f"sqlite:///{tmp_path / 'runs' / 'mlflow.db'}")
-    (experiment,) = [one for one in client.search_experiments() if one.name == "tiny"]
-    (recorded,) = client.search_runs([experiment.experiment_id])
+    (experiment,) = [one for one in mlflow_here.search_experiments() if one.name == "tiny"]
+    (recorded,) = mlflow_here.search_runs([experiment.experiment_id])
     assert recorded.info.status == "FINISHED"
 
 
@@ -274,14 +268,13 @@ def test_a_run_that_was_stopped_uses_its_budget_up_if_no_rule_is_asked_for(train
     assert (found["reason"], found["stopping"]) == ("budget reached: iterations", None)
 
 
-def test_mlflow_does_not_name_a_rule_that_no_longer_ends_the_run(call, tmp_path):
+def test_mlflow_does_not_name_a_rule_that_no_longer_ends_the_run(call, mlflow_here):
     quick = ("experiment=tiny", "collector=in_process", "collector.threads=1", *OFTEN)
     ended = call("train", *quick, *SOON, "budget.env_steps=null", "budget.iterations=4")
-    client = MlflowClient(tracking_uri=f"sqlite:///{tmp_path / 'runs' / 'mlflow.db'}")
     run_id = json.loads((ended.folder / "mlflow.json").read_text())["run_id"]
-    assert client.get_run(run_id).data.tags["stopping.rule"] == "plateau"
+    assert mlflow_here.get_run(run_id).data.tags["stopping.rule"] == "plateau"
     assert call("resume", ended.folder.name, "stopping=none").code == 0
-    tags = client.get_run(run_id).data.tags
+    tags = mlflow_here.get_run(run_id).data.tags
     assert (tags["stopping.rule"], tags["end"]) == ("none", "finished: budget reached: iterations")
 
 

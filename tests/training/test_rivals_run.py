@@ -7,18 +7,11 @@ import pytest
 
 from deepracer_exp.runs.checkpoints import check, read_training
 from deepracer_exp.runs.run_files import read_metrics
-from tests.conftest import IN_WORKERS
+from tests.conftest import IN_WORKERS, OFTEN, POOL, RACE, THREE
 
 from .conftest import assert_same_run
 
-RACE = ("race=head_to_head", "observation.next_objects=1")
-OFTEN = (
-    "episode.max_steps=60",
-    "evaluation.time_s=4",
-    "checkpoints.every=2",
-    "algorithm.frames_per_iteration=512",
-)
-SIX, FOUR, THREE = (("budget.env_steps=null", f"budget.iterations={count}") for count in (6, 4, 3))
+SIX, FOUR, TWO = (("budget.env_steps=null", f"budget.iterations={count}") for count in (6, 4, 2))
 
 
 def snapshots(run) -> list[int]:
@@ -26,26 +19,25 @@ def snapshots(run) -> list[int]:
 
 
 def test_snapshots_are_taken_at_intervals_and_the_oldest_go(trained):
-    run = trained(*RACE, *OFTEN, *SIX, "race.rivals.snapshot_every=2", "race.rivals.pool_size=3").folder
-    assert snapshots(run) == [2, 4, 6]
-    run = trained(*RACE, *OFTEN, *SIX, "race.rivals.snapshot_every=4").folder
+    assert snapshots(trained(*OFTEN, *POOL, *SIX).folder) == [4, 5, 6]
+    run = trained(*OFTEN, *RACE, *SIX, "race.rivals.snapshot_every=4").folder
     assert snapshots(run) == [0, 4]
     won = [row.get("eval_won") for row in read_metrics(run / "metrics.jsonl")]
     assert [value is None for value in won] == [True, False] * 3
 
 
 def test_the_rival_decides_what_is_learned(trained):
-    losses = []
-    for policy in ("newest", "pool"):
-        run = trained(
-            *RACE, *OFTEN, *FOUR, "race.rivals.snapshot_every=1", f"race.rivals.policy={policy}"
-        ).folder
-        losses.append([row["policy_loss"] for row in read_metrics(run / "metrics.jsonl")])
+    newest = (*RACE, "race.rivals.policy=newest", "race.rivals.snapshot_every=1", "race.rivals.pool_size=3")
+    losses = [
+        [row["policy_loss"] for row in read_metrics(trained(*OFTEN, *rivals, *SIX).folder / "metrics.jsonl")]
+        for rivals in (POOL, newest)
+    ]
     # Up to the first iteration with two snapshots, and from then on.
     assert losses[0][:1] == losses[1][:1]
     assert losses[0][2:] != losses[1][2:]
 
 
+@pytest.mark.usefixtures("workers_start_early")
 def test_rivals_reach_the_workers_and_a_resumed_run_of_several_is_the_uninterrupted_one(call, tmp_path):
     def trained_by_two(name: str, *overrides: str):
         ended = call(
@@ -56,26 +48,26 @@ def test_rivals_reach_the_workers_and_a_resumed_run_of_several_is_the_uninterrup
         (config,) = (tmp_path / "runs" / name).glob("*/config.yaml")
         return config.parent
 
-    whole, run = trained_by_two("whole", *FOUR), trained_by_two("half", *THREE)
-    ended = call("resume", run.name, "budget.iterations=4")
+    whole, run = trained_by_two("whole", *THREE), trained_by_two("half", *TWO)
+    ended = call("resume", run.name, "budget.iterations=3")
     assert ended.code == 0, ended.stderr
     rows = [
         [(row["policy_loss"], row["mean_return"]) for row in read_metrics(folder / "metrics.jsonl")]
         for folder in (whole, run)
     ]
     assert rows[0] == rows[1]
-    assert snapshots(run) == [0, 1, 2, 3, 4]
+    assert snapshots(run) == [0, 1, 2, 3]
 
 
 def test_against_another_run_a_resumed_training_needs_only_its_own_folder(trained, copied, call):
-    other = copied("observation.lookahead_m=[0.5,1.0]")  # sees something else, and no other car
+    other = copied("observation.lookahead_m=[0.5,1.0]", *OFTEN, *TWO)  # sees something else, and no other car
     against = (*RACE, *OFTEN, f"race.rivals.policy={other}")
-    whole = trained(*against, *SIX).folder
+    whole = trained(*against, *FOUR).folder
     run = copied(*against, *THREE)
     kept = run / "rival" / "checkpoints"
     assert [path.name for path in kept.iterdir()] == [(other / "checkpoints" / "best").resolve().name]
     shutil.rmtree(other)
-    ended = call("resume", run.name, "budget.iterations=6")
+    ended = call("resume", run.name, "budget.iterations=4")
     assert ended.code == 0, ended.stderr
     assert_same_run(run, whole)
     raced = call("evaluate", run.name, "evaluation.trials=2", "evaluation.time_s=2")
@@ -84,7 +76,7 @@ def test_against_another_run_a_resumed_training_needs_only_its_own_folder(traine
 
 
 def test_a_clone_begins_its_pool_with_its_parent_s_policy(copied, call, tmp_path):
-    parent = copied(*RACE, *OFTEN, *THREE)
+    parent = copied(*OFTEN, *POOL, *THREE)
     ended = call("clone", parent.name, "budget.iterations=1", "name=child")
     assert ended.code == 0, ended.stderr
     (child,) = (tmp_path / "runs" / "child").glob("*/config.yaml")

@@ -13,15 +13,15 @@ from .conftest import assert_same_run
 
 SAC = (
     *("action_space=continuous", "algorithm=sac", "algorithm.batch_size=32", "algorithm.warmup_steps=256"),
-    *(
-        "algorithm.frames_per_iteration=256",
-        "checkpoints.every=2",
-        "evaluation.time_s=4",
-        "episode.max_steps=40",
-    ),
+    *("algorithm.frames_per_iteration=256", "checkpoints.every=2", "episode.max_steps=40"),
+    *("evaluation.time_s=4", "evaluation.trials=1"),
 )
 SMALL = "algorithm.replay_steps=700"
 """Fewer steps than are driven before and after the interruption: the oldest are replaced."""
+PICTURES = (
+    *("observation=camera_small", "observation.camera.frames=2", "randomization=sim2real"),
+    *("network.filters=[4,4,4]", "network.hidden=[16]", "evaluation.time_s=1"),
+)
 
 
 def budget(iterations: int) -> tuple[str, str]:
@@ -36,11 +36,10 @@ def replays(run) -> list[str]:
     "overrides",
     [
         SAC,
-        (*SAC, SMALL, "randomization=sim2real"),
         (*SAC, "action_space=discrete"),
-        (*SAC, SMALL, "observation=camera_small", "network.hidden=[16]"),
+        (*SAC, SMALL, *PICTURES),
     ],
-    ids=["continuous", "full", "list", "camera"],
+    ids=["continuous", "list", "full, of pictures"],
 )
 def test_a_run_that_continues_is_the_run_that_was_never_interrupted(trained, copied, call, overrides):
     whole = trained(*overrides, *budget(6))
