@@ -15,7 +15,9 @@ from deepracer_exp.config.compose import compose_entry, compose_experiment, trus
 from deepracer_exp.sweeps.queue.storage import open_storage
 from deepracer_exp.sweeps.queue.study import load_study
 
-TINY = ("experiment=tiny", "collector=in_process", "collector.threads=1", "budget.env_steps=2048")
+from .conftest import OFTEN, THREE
+
+TINY = ("experiment=tiny", "collector=in_process", "collector.threads=1", *OFTEN, *THREE)
 EVIL = "from pathlib import Path\nPath({canary!r}).touch()\n\ndef reward_function(params):\n    return 1.0\n"
 EVIL_CLASS = (
     "from pathlib import Path\nPath({canary!r}).touch()\nimport torch\nclass Net(torch.nn.Sequential): ...\n"
@@ -65,9 +67,9 @@ def listener():
 
 
 @pytest.fixture
-def stranger(copied, account, listener, monkeypatch):
+def stranger(copied, account, listener, mlflow_here, monkeypatch):
     """Return the folder of a run whose owner has written into it what they would like to happen, and a canary."""
-    run = copied("budget.env_steps=2048")
+    run = copied(*OFTEN, *THREE)
     canary = run.parents[2] / "canary"
     config = yaml.safe_load((run / "config.yaml").read_text())
     config["budget"] |= {"alert_command": f"touch {canary}", "alerts": [1, 50]}
@@ -81,8 +83,8 @@ def stranger(copied, account, listener, monkeypatch):
 
 
 COMMANDS = {
-    "clone": ("clone", "budget.env_steps=2048"),
-    "resume": ("resume", "budget.env_steps=4096"),
+    "clone": ("clone", "budget.iterations=1"),
+    "resume": ("resume", "budget.iterations=4"),
     "deliver": ("resume",),
     "evaluate": ("evaluate", "evaluation.trials=1", "evaluation.laps=1", "evaluation.time_s=3"),
 }
@@ -111,7 +113,7 @@ def test_a_run_of_a_stranger_runs_no_command_and_sends_nothing_to_its_server(
 
 def test_what_is_named_now_is_taken_over(stranger, call):
     run, canary = stranger
-    more = (f"budget.alert_command=touch {canary}", "tracking=off", "budget.env_steps=2048")
+    more = (f"budget.alert_command=touch {canary}", "tracking=off", "budget.iterations=1")
     ended = call("clone", str(run), *more)
     assert ended.code == 0, ended.stderr
     assert "not taken over" not in ended.stderr
@@ -126,10 +128,10 @@ def test_a_reward_function_of_a_stranger_is_not_run_until_it_is_named(stranger, 
     config = yaml.safe_load((run / "config.yaml").read_text())
     config["reward"] |= {"file": str(evil)}
     (run / "config.yaml").write_text(yaml.safe_dump(config))
-    call(command, str(run), "budget.env_steps=4096").assert_refused()
+    call(command, str(run), "budget.iterations=4").assert_refused()
     assert not canary.exists()
     if command == "clone":
-        ended = call("clone", str(run), "budget.env_steps=2048", f"reward.file={evil}")
+        ended = call("clone", str(run), "budget.iterations=1", f"reward.file={evil}")
         assert ended.code == 0, ended.stderr
         assert canary.exists()
 
@@ -150,7 +152,7 @@ def test_a_run_of_ones_own_is_resumed_and_cloned_with_all_that_it_had(call, acco
         sent.unlink()
         new_command(monkeypatch)
         # A copy elsewhere is the user's own as well: contents count, not places.
-        ended = call(command, str(run), "budget.env_steps=4096")
+        ended = call(command, str(run), "budget.iterations=4")
         assert ended.code == 0, ended.stderr
         assert "not taken over" not in ended.stderr
         assert sent.exists()

@@ -106,7 +106,7 @@ def test_wherever_a_run_ends_its_last_policy_is_evaluated_and_all_name_the_same_
 
 
 def test_the_lines_to_paste_after_a_training_work(trained, copied, call):
-    limits = ("budget.iterations=1", "budget.env_steps=1")  # reached by the same iteration
+    limits = (*OFTEN, "budget.iterations=1", "budget.env_steps=1")  # reached by the same iteration
     run = copied(*limits)
     # One of another experiment that began in the same second.
     shutil.copytree(run, run.parents[1] / "other" / run.name, symlinks=True)
