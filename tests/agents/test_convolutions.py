@@ -54,7 +54,7 @@ def relative_error(values, expected):
         ("cnn_small", (1, 60, 81), {"strides": (3, 2, 1)}),
         ("cnn_small", (1, 48, 64), {"strides": (8, 1, 1), "kernels": (16, 2, 2)}),
         ("cnn_small", (1, 32, 32), {"strides": (1, 2, 1)}),
-        ("medium", GREY, {}),  # a kernel of two and a half blocks
+        ("medium", GREY, {"hidden": (32,)}),  # a kernel of two and a half blocks
         ("attention", GREY, {}),
         ("deep", GREY, {}),
     ],

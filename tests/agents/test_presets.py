@@ -26,12 +26,12 @@ from deepracer_exp.config.options import options
 @pytest.mark.parametrize("name", options("network"))
 def test_every_network_acts_and_judges(name, action_count, sensors):
     config = compose_option("network", name, NetworkConfig)
-    pixels = torch.randint(0, 256, (3, 2, 96, 96), dtype=torch.uint8)
+    pixels = torch.randint(0, 256, (3, 2, 84, 84), dtype=torch.uint8)
     sensed = {"observation": torch.randn(3, 11), "pixels": pixels, "lidar": torch.rand(3, 64)}
     if name == "lidar":
         observed = ObservationShape(11, None, 64)
     else:
-        observed = ObservationShape(11, (2, 96, 96), 64 if sensors == "both" else None)
+        observed = ObservationShape(11, (2, 84, 84), 64 if sensors == "both" else None)
     networks = build_actor_critic(config, observed, action_count, torch.Generator())
     assert set(networks.policy.in_keys) == ({"observation"} if name.startswith("mlp") else set(observed.seen))
     steps = networks.value(networks.policy(TensorDict(sensed, [3])))

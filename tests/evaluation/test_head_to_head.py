@@ -9,6 +9,7 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.race_protocol import Attempt, RaceProtocol
 from deepracer_exp.evaluation.rival_protocol import DRAWN, LOST, WON, RivalProtocol
+from tests.conftest import OFTEN, POOL, THREE
 
 from .conftest import Driver
 
@@ -98,8 +99,8 @@ def test_other_races_have_no_winner(experiment, protocol):
 
 
 def test_evaluate_races_one_run_against_another_and_says_so(copied, call, tmp_path):
-    run = copied("race=head_to_head", "observation.next_objects=1")
-    other = copied("seed=1")  # sees no other car
+    run = copied(*OFTEN, *POOL, *THREE)
+    other = copied(*OFTEN, *THREE, "seed=1")  # sees no other car
     ended = call(
         *("evaluate", run.name, "evaluation=head_to_head", f"rival={other.name}", "rival_checkpoint=last"),
         *("evaluation.trials=2", "evaluation.laps=1", "evaluation.time_s=4"),
@@ -131,7 +132,7 @@ def test_a_rival_that_cannot_race_is_refused_in_one_line(copied, call):
 
 
 def test_pages_of_a_policy_against_itself_take_no_rival(copied, call):
-    run = copied("race=head_to_head", "observation.next_objects=1")
+    run = copied(*OFTEN, *POOL, *THREE)
     for flags in (("--live",), ("--replay", "laps.html")):
         ended = call("watch", run.name, "evaluation=head_to_head", f"rival={run.name}", *flags)
         ended.assert_refused("rival=", flags[0], "against itself")

@@ -145,16 +145,19 @@ def followed(track: Track, pose: np.ndarray, lens: Lens, per_pixel: int) -> np.n
     return counted.reshape(shape).mean(axis=(2, 4))
 
 
-@pytest.mark.parametrize("name", TRACKS)
 @pytest.mark.parametrize(
-    ("ndist", "side", "angles"),
-    [(0.1, 0.0, (0.0, 0.0, 0.0)), (0.4, 0.2, (0.5, 0.05, -0.04)), (0.8, -0.25, (-2.0, -0.08, 0.06))],
+    ("name", "ndist", "side", "angles"),
+    [
+        ("reinvent_base", 0.1, 0.0, (0.0, 0.0, 0.0)),
+        ("Spain_track", 0.4, 0.2, (0.5, 0.05, -0.04)),
+        ("Straight_track", 0.8, -0.25, (-2.0, -0.08, 0.06)),
+    ],
 )
 def test_a_pixel_is_the_mean_of_what_its_rays_meet(name, ndist, side, angles):
     """The far centre line has the colour that its dashes run together to: this and `dash` count as one material."""
     track = world_track(name)
     pose = pose_on(track, ndist, side, angles)
-    ours, theirs = shares(SCENERIES[name], pose)[0], followed(track, pose[0], LENS, 16)
+    ours, theirs = shares(SCENERIES[name], pose)[0], followed(track, pose[0], LENS, 12)
     dash, far = MATERIALS.index("dash"), MATERIALS.index("far_dash")
     error = np.abs(ours - theirs)
     error[[dash, far]] = 0
@@ -306,7 +309,7 @@ def met_boxes(boxes: np.ndarray, per_pixel: int) -> tuple[np.ndarray, np.ndarray
     return np.isfinite(nearest).reshape(shape).mean(axis=(1, 3)), grey.reshape(shape).mean(axis=(1, 3))
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_boxes_cover_what_rays_meet_first(seed):
     generator = np.random.default_rng(seed)
     places = [(ahead, left) for ahead in (-0.2, 0.7, 1.6, 2.6) for left in (-0.7, 0.0, 0.7)]
