@@ -7,7 +7,6 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
-from mlflow import MlflowClient
 from mlflow.models import Model
 from tensordict import TensorDict
 
@@ -16,9 +15,10 @@ from deepracer_exp import load_policy
 from tests.conftest import IN_PROCESS
 
 CAMERA = (
-    *("observation=camera_small", "collector.cars=8", "algorithm.frames_per_iteration=512"),
-    *("algorithm.epochs=2", "budget.env_steps=1024", "checkpoints.every=null"),
+    *("observation=camera_small", "collector.cars=4", "algorithm.frames_per_iteration=128"),
+    *("algorithm.batch_size=64", "algorithm.epochs=2", "budget.env_steps=256", "checkpoints.every=null"),
 )
+SMALL = ("observation.camera.width=80", "observation.camera.height=60")
 
 
 @pytest.mark.parametrize(
@@ -26,15 +26,15 @@ CAMERA = (
     [
         ("network.critic=pictures", "network.shared_trunk=true", "observation.camera.color=rgb"),
         (
-            *("observation=stereo", "network=medium", "network.critic=pictures", "action_space=continuous"),
-            *("observation.camera.width=80", "observation.camera.height=60", "budget.env_steps=512"),
+            *("observation=stereo", "network=medium", "network.hidden=[32]", "network.critic=pictures"),
+            *("action_space=continuous", *SMALL),
         ),
-        ("observation=camera", "network=deep", "observation.camera.frames=2", "budget.env_steps=512"),
-        ("observation=lidar", "network.critic=pictures", "observation.lidar.kind=sectors"),
         (
-            *("observation=camera_lidar", "network=attention", "observation.camera.width=80"),
-            *("observation.camera.height=60", "network.shared_trunk=true", "budget.env_steps=512"),
+            *("observation.camera.width=100", "observation.camera.height=84", "network=deep"),
+            "observation.camera.frames=2",
         ),
+        ("observation=lidar", "network.critic=pictures", "observation.lidar.kind=sectors"),
+        ("observation=camera_lidar", "network=attention", *SMALL, "network.shared_trunk=true"),
     ],
     ids=" ".join,
 )
@@ -44,11 +44,11 @@ def test_every_kind_of_picture_and_network_trains_and_is_raced(trained, call, ov
     losses = [row["value_loss"] for row in ended.metrics]
     assert len(set(losses)) == len(losses)
     assert all(np.isfinite(row["grad_norm"]) and row["grad_norm"] > 0 for row in ended.metrics)
-    raced = call("evaluate", str(ended.folder), "evaluation.trials=1", "evaluation.time_s=10")
+    raced = call("evaluate", str(ended.folder), "evaluation.trials=1", "evaluation.time_s=2")
     assert raced.code == 0, raced.stderr
 
 
-SENSORS = ("observation=camera_lidar", "observation.camera.width=80", "observation.camera.height=60")
+SENSORS = ("observation=camera_lidar", *SMALL)
 
 # The service's reach of 1 m ends before the walls of the default track.
 FAR_LIDAR = ("observation=lidar", "observation.lidar.reach_m=12")
@@ -73,10 +73,10 @@ def test_the_stored_policy_and_its_onnx_file_see_the_same(trained, call, tmp_pat
 
 
 def test_the_memory_of_pictures_is_shown_before_the_run_and_refused_with_what_fits(trained, copied, call):
-    started, resumed = trained(*CAMERA), call("resume", copied(*CAMERA).name, "budget.env_steps=1536")
+    started, resumed = trained(*CAMERA), call("resume", copied(*CAMERA).name, "budget.env_steps=384")
     for ended in (started, resumed):
         (line,) = (line for line in ended.stderr.splitlines() if line.startswith("pictures: "))
-        assert "0.0 GB of memory for the 512 steps" in line
+        assert "0.0 GB of memory for the 128 steps" in line
     big = "algorithm.frames_per_iteration=10000000"
     refused = call("train", *IN_PROCESS, "observation=camera", "name=big", big)
     refused.assert_refused("up to ")
@@ -89,7 +89,7 @@ def test_an_update_takes_the_cores_that_are_the_trainings_own(call, monkeypatch,
     asked, set_threads = [], torch.set_num_threads
     monkeypatch.setattr("deepracer_exp.training.trainer.cores", lambda: 2)
     monkeypatch.setattr(torch, "set_num_threads", lambda count: (asked.append(count), set_threads(count)))
-    ended = call("train", *IN_PROCESS, *CAMERA, "budget.env_steps=512", f"collector.threads={threads}")
+    ended = call("train", *IN_PROCESS, *CAMERA, "budget.env_steps=128", f"collector.threads={threads}")
     assert ended.code == 0, ended.stderr
     assert max(asked) == most
 
@@ -105,7 +105,7 @@ def test_the_report_shows_what_the_policy_sees_along_a_lap(trained, call, tmp_pa
 
 def test_a_clone_keeps_what_the_networks_were_made_for(copied, call):
     parent = copied(*CAMERA)
-    cloned = call("clone", parent.name, "budget.env_steps=512")
+    cloned = call("clone", parent.name, "budget.env_steps=128")
     assert cloned.code == 0, cloned.stderr
     for changes, words in (
         (["observation.camera.width=100"], ["camera.width: 80 -> 100"]),
@@ -114,14 +114,14 @@ def test_a_clone_keeps_what_the_networks_were_made_for(copied, call):
         call("clone", parent.name, *changes).assert_refused(*words)
 
 
-def test_a_promoted_model_says_that_it_reads_pictures(call, tmp_path):
-    ended = call("train", *IN_PROCESS, *CAMERA, "tracking=mlflow", "budget.env_steps=512", "name=eye")
+def test_a_promoted_model_says_that_it_reads_pictures(call, mlflow_here):
+    evaluated = ("checkpoints.every=1", "evaluation.trials=1", "evaluation.time_s=1", "budget.env_steps=128")
+    ended = call("train", *IN_PROCESS, *CAMERA, *evaluated, "tracking=mlflow", "name=eye")
     assert ended.code == 0, ended.stderr
     promoted = call("runs", "promote", ended.folder.name)
     assert promoted.code == 0, promoted.stderr
-    client = MlflowClient(f"sqlite:///{tmp_path / 'runs' / 'mlflow.db'}")
-    version = client.get_model_version_by_alias("eye", "champion")
-    logged = client.get_logged_model(version.source.removeprefix("models:/"))
+    version = mlflow_here.get_model_version_by_alias("eye", "champion")
+    logged = mlflow_here.get_logged_model(version.source.removeprefix("models:/"))
     folder = Path(logged.artifact_location.removeprefix("file://"))
     (spec,) = Model.load(str(folder / "MLmodel")).signature.inputs.inputs
     assert (spec.name, spec.type, spec.shape) == ("pixels", np.dtype(np.uint8), (-1, 1, 60, 80))

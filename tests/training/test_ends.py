@@ -122,7 +122,7 @@ def test_the_lines_to_paste_after_a_training_work(trained, copied, call):
 
 @pytest.mark.parametrize(
     "overrides",
-    [(), ("track=[reinvent_base,Oval_track]", "race=object_avoidance")],
+    [(), ("track=[reinvent_base,Oval_track]", "race=object_avoidance", "observation.next_objects=2")],
     ids=" ".join,
 )
 def test_a_run_has_pictures_as_soon_as_it_has_an_iteration(train_here, tmp_path, overrides):

@@ -91,15 +91,15 @@ def test_another_seed_gives_another_run(trained):
 
 @pytest.mark.usefixtures("workers_start_early")
 def test_the_same_seed_gives_the_same_run_in_one_process_and_in_several(call, tmp_path):
-    command = ("train", "experiment=tiny", "tracking=off", *OFTEN, "budget.env_steps=512")
+    command = ("train", "experiment=tiny", "tracking=off", *OFTEN, "collector.cars=16")
     folders = []
     for name, where in (("alone", "mode=in_process"), ("four", "processes=4")):
-        ended = call(*command, f"name={name}", f"collector.{where}")
+        ended = call(*command, "budget.env_steps=1024", f"name={name}", f"collector.{where}")
         assert ended.code == 0, ended.stderr
         folders += (tmp_path / "runs" / name).iterdir()
     assert_same_run(*folders)
-    assert len(read_metrics(folders[0] / "metrics.jsonl")) == 2
-    assert len(read_trace(folders[0] / "trace", ["steps"])) == 512
+    assert len(read_metrics(folders[0] / "metrics.jsonl")) == 4
+    assert len(read_trace(folders[0] / "trace", ["steps"])) == 1024
 
 
 @pytest.mark.parametrize(
