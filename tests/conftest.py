@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
-from unittest import mock
 
 import psutil
 import pytest
@@ -347,16 +346,10 @@ RACE = ("race=head_to_head", "observation.next_objects=1")
 POOL = (*RACE, "race.rivals.policy=pool", "race.rivals.snapshot_every=1", "race.rivals.pool_size=3")
 
 
-def call_in(cwd: Path, *arguments: str, pictures: bool = False) -> Ended:
-    """Call `deepracer-exp ARGUMENTS` in this process with `cwd` as the working folder.
-
-    A training draws its pictures if they are asked for only: they take as long as all the rest of a tiny one.
-    """
+def call_in(cwd: Path, *arguments: str) -> Ended:
+    """Call `deepracer-exp ARGUMENTS` in this process with `cwd` as the working folder."""
     out, err = io.StringIO(), io.StringIO()
-    trains = arguments[:1] in (("train",), ("resume",), ("clone",))
-    drawn = "deepracer_exp.reports.pages.run_page.write_pictures"
     with (
-        mock.patch(drawn) if trains and not pictures else contextlib.nullcontext(),
         contextlib.chdir(cwd),
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),

@@ -58,7 +58,6 @@ def test_paths_of_any_name_work(train_here, tmp_path):
         f"reward.file={quoted(folder / f'{name}.py')}",
         f"track.file={quoted(folder / f'{name}.npy')}",
         f"action_space.file={quoted(folder / f'{name}.json')}",
-        pictures=True,
     )
     assert ended.code == 0, ended.stderr
     (summary,) = (folder / "runs").glob("*/*/summary.json")

@@ -128,7 +128,7 @@ def test_the_lines_to_paste_after_a_training_work(trained, copied, call):
 def test_a_run_has_pictures_as_soon_as_it_has_an_iteration(train_here, tmp_path, overrides):
     write_pictures(tmp_path, build_courses(compose_experiment([])[0]))
     assert not list(tmp_path.iterdir())
-    ended = train_here("budget.iterations=1", *overrides, pictures=True)  # without a lap
+    ended = train_here("budget.iterations=1", *overrides)  # without a lap
     assert ended.code == 0, ended.stderr
     for name in ("best_lap.png", "learning.png"):
         assert (ended.folder / name).read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
