@@ -1,10 +1,9 @@
 """The two lanes of courses, in which boxes stand and bots drive, and to which cars are put back."""
 
 import math
-from collections.abc import Callable, Sequence
-from functools import wraps
-from typing import NamedTuple, TypeVar
-from weakref import WeakKeyDictionary
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,20 +20,6 @@ _TIE_M, _NEARBY_M = 1e-3, 1.0
 """Distances that count as equal, and largest shift along the lap of the projection of a lane's point."""
 
 Floats = NDArray[np.float64]
-Result = TypeVar("Result")
-
-
-def _once_per_track(find: Callable[[Track], Result]) -> Callable[[Track], Result]:
-    """Keep the result with its track: both lanes take 20 ms, and a validation among others needs them 100 times."""
-    results: WeakKeyDictionary[Track, Result] = WeakKeyDictionary()
-
-    @wraps(find)
-    def kept(track: Track) -> Result:
-        if track not in results:
-            results[track] = find(track)
-        return results[track]
-
-    return kept
 
 
 class Paths(NamedTuple):
@@ -100,14 +85,18 @@ def _points(track: Track) -> tuple[Floats, Floats]:
     return (track.waypoints + track.inner) / 2, (track.waypoints + track.outer) / 2
 
 
-@_once_per_track
+# Both lanes of a course take 20 ms, and a validation among others asks for them a hundred times.
+_once = lru_cache(maxsize=256)
+
+
+@_once
 def _lines(track: Track) -> tuple[Segments, Segments]:
     """Return both lanes of a course."""
     inner, outer = _points(track)
     return build_segments(inner), build_segments(outer)
 
 
-@_once_per_track
+@_once
 def _path_rows(track: Track) -> tuple[Floats, Floats]:
     """Return the rows of `Paths` for both lanes of a course."""
     inner, outer = _points(track)
