@@ -21,6 +21,8 @@ export SSL_CERT_FILE ?= $(PIP_CERT)
 endif
 # Compiled once here and not by every process: importing PyTorch and MLflow from sources takes three times as long.
 INSTALL = $(BIN)/uv pip install --compile-bytecode --python $(BIN)/python --constraint constraints.txt
+# A busy machine needs longer than the minute that uv gives each file.
+export UV_COMPILE_BYTECODE_TIMEOUT ?= 900
 # Numba compiles the cars in the first process that drives: half a minute on one core.
 WARM = runs=$$(mktemp -d) && { $(BIN)/deepracer-exp train experiment=tiny tracking=off runs_dir=$$runs >$$runs/log 2>&1 || \
 	{ cat $$runs/log; exit 1; }; } && rm -r $$runs
