@@ -42,6 +42,10 @@ settings.register_profile("same", deadline=None, derandomize=True)
 settings.register_profile("new", deadline=None, print_blob=True)
 settings.load_profile("same")
 
+# Read when torch and NumPy are loaded. Two processes of tests share the cores, and more threads of each wait for one
+# another: beside other work they took twice as long. What a training sets itself counts, as for everyone.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 # Where containers forbid it, every process would compile the tests and the package again: ten seconds of each worker.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
