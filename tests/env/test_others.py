@@ -166,7 +166,7 @@ def test_bots_change_lanes_as_often_as_configured(race_of):
 
 
 def test_a_bot_that_hits_the_car_from_behind_stops_all_bots_and_is_to_blame(race_of):
-    race = race_of(ON, *BOTS, "race.bots.lane_change_after_s=null", *STANDING)
+    race, resumed = (race_of(ON, *BOTS, "race.bots.lane_change_after_s=null", *STANDING) for _ in range(2))
     others = race.others.others
     stop(race, 3)
     bot_m, offset_m = float(others.distance_m[0, 2]), float(others.offset_m[0, 2])
@@ -175,8 +175,10 @@ def test_a_bot_that_hits_the_car_from_behind_stops_all_bots_and_is_to_blame(race
     assert "crashed" not in statuses
     assert others.pauses[0] == 1
     standing = others.poses.copy()
-    stop(race, 10)
-    np.testing.assert_array_equal(others.poses, standing)
+    resumed.load_state_dict(race.state_dict())
+    for one in (race, resumed):
+        stop(one, 10)
+        np.testing.assert_array_equal(one.others.others.poses, standing)
     stop(race, 30)
     assert (others.poses != standing).any()
 

@@ -103,11 +103,14 @@ def test_the_return_sums_the_rewards_of_the_episode(race_of, column):
         race.reset(np.flatnonzero(ended))
 
 
-def test_the_clock_runs_at_the_control_rate_of_the_car(race_of, column):
-    race = race_of("car.control_hz=30")
-    for _ in range(6):
-        race.step(np.zeros(1, np.int64))
-    assert column(race, "tstamp")[0] == pytest.approx(0.2)
+def test_the_clock_runs_at_the_control_rate_of_the_car_and_goes_on_over_episodes(race_of, column, spy):
+    race = race_of("car.control_hz=30", spy)
+    for steps in (6, 9):
+        for _ in range(steps):
+            race.step(np.zeros(1, np.int64))
+        race.reset()
+    assert column(race, "tstamp")[0] == pytest.approx(0.5)
+    assert spied(race)[0][-1]["sim_time"] == pytest.approx(0.5)
 
 
 # --- The params of a reward function

@@ -126,3 +126,21 @@ def test_a_car_that_was_reversed_for_ten_steps_ends_its_episode_after_five_more(
     after.load_state_dict(before.state_dict())
     verdicts = [apply(after, step) for step in range(12, 17)]
     assert verdicts == [STATUS_CODE["in_progress"]] * 4 + [STATUS_CODE["reversed"]]
+
+
+def test_a_car_that_stands_ends_its_episode_in_the_same_step_although_its_race_was_interrupted():
+    # A car that is told to stand rolls some millimetres a step.
+    setup = make_setup("action_space=continuous", "action_space.speed.low=0", "episode.immobilized_m=0.01")
+    before, after = Race(setup, 1), Race(setup, 1)
+
+    def steps_until_the_end(race: Race, most: int) -> int:
+        for step in range(most):
+            race.step(np.array([[0.0, -1.0]]))
+            if race.terminated[0]:
+                return step
+        return most
+
+    before.reset()
+    assert steps_until_the_end(before, 12) == 12
+    after.load_state_dict(before.state_dict())
+    assert steps_until_the_end(after, 40) == steps_until_the_end(before, 40) < 40
