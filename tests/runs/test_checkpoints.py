@@ -97,8 +97,10 @@ def test_a_pinned_checkpoint_is_kept(store):
     for iteration in (1, 2):
         store.save(make_agent(iteration), {"iteration": iteration}, TRAINING)
     assert names(store) == ["000000", "000002", "last", "pinned.json"]
+    pin(store.folder, "000002", "runner-up")
     store.rewind(0, None)
-    assert names(store) == ["000000", "last", "pinned.json"]
+    assert names(store) == ["000000", "000002", "last", "pinned.json"]
+    assert (store.folder / "last").readlink().name == "000000"
 
 
 def test_a_store_that_does_not_know_what_must_stay_removes_nothing(store, tmp_path):

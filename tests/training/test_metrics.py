@@ -5,8 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.stopping import NoStopping, ReliableStopping
+from deepracer_exp.env.setup import build_setup
 from deepracer_exp.env.trace_columns import PACKED, STATUS_CODE
+from deepracer_exp.training.best_policy import BestPolicy
 from deepracer_exp.training.metrics import Finished, Ranking, RunMetrics
 from deepracer_exp.training.stopping.stopping_rules import build_rule
 
@@ -195,3 +198,14 @@ def test_a_track_counts_with_the_last_iteration_that_ended_an_episode_on_it():
     assert ranking.rank(ended(*[(0, 100.0, 5.0)] * 12)) == (100.0, 2.0)
     assert ranking.rank(ended()) is None
     assert ranking.rank(ended((1, 40.0, 5.0))) == (70.0, 1.0)
+
+
+def test_a_resumed_run_ranks_its_policies_as_if_it_had_never_been_interrupted():
+    experiment, _ = compose_experiment(["experiment=tiny", "checkpoints.every=null"])
+    setup = build_setup(compose_experiment(["experiment=tiny", "track=[reinvent_base,Oval_track]"])[0])
+    before, after = BestPolicy(experiment, setup), BestPolicy(experiment, setup)
+    assert not before.drove_best(ended(*[(0, 50.0, 1.0)] * 20), {"iteration": 1, "env_steps": 100})
+    after.load_state_dict(before.state_dict())
+    for policy in (before, after):
+        assert policy.drove_best(ended((1, 100.0, 5.0)), {"iteration": 2, "env_steps": 200})
+    assert after.record == before.record

@@ -11,10 +11,12 @@ import yaml
 
 from deepracer_exp.agents.ppo import PPO
 from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.env.setup import build_setup
 from deepracer_exp.errors import RunFailed
 from deepracer_exp.runs.checkpoints import check, checkpoint_name, read_checkpoint, read_training
 from deepracer_exp.runs.folder import RunFolder
 from deepracer_exp.runs.run_files import read_metrics, read_object
+from deepracer_exp.runs.run_result import FINISHED, Ending
 from deepracer_exp.tracking.resolve import resolve
 from deepracer_exp.training import signals
 from deepracer_exp.training.plan import plan_training
@@ -121,6 +123,18 @@ def test_the_clock_begins_with_the_first_step_and_goes_on_where_it_stopped(cut, 
     assert ended.code == 0, ended.stderr
     assert seen == [(stored, stored)]
     assert rows(run)[-1]["wall_clock_s"] > stored
+
+
+def test_a_resumed_run_reports_the_first_lap_that_it_drove_before(tmp_path):
+    experiment, composition = compose_experiment(["experiment=tiny"])
+    folder = RunFolder(tmp_path)
+    trainer = Trainer(experiment, build_setup(experiment), folder, composition.mapping, ())
+    trainer.save()
+    checkpoint = check(trainer.checkpoints.folder / "last")
+    lap = {"env_steps": 512, "since_process_start_s": 2.5}
+    trainer.load(checkpoint, read_training(checkpoint) | {"first_lap": lap})
+    trainer.end(Ending(FINISHED, "the budget is used up"), 0)
+    assert summary(tmp_path)["first_lap"] == lap
 
 
 def test_a_copy_without_links_continues_as_the_run_itself(trained, cut, call):
