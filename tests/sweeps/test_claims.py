@@ -73,6 +73,29 @@ def test_an_owner_that_claims_again_gets_its_trial_again(claims):
     assert len(claims.all()) == 1
 
 
+def test_a_lease_that_was_renewed_while_another_looked_is_not_taken_over(claims, monkeypatch):
+    late, look = claims.claim("late", 1, 0.0), claims._open_to
+
+    def renewed_meanwhile(*arguments: object):
+        found = look(*arguments)
+        assert claims.renew(late, HOUR_S)
+        return found
+
+    monkeypatch.setattr(claims, "_open_to", renewed_meanwhile)
+    assert claims.claim("other", 1, HOUR_S) is None
+    assert claims.renew(late, HOUR_S)
+
+
+def test_an_owner_that_took_its_own_trial_over_writes_by_its_newer_claim_alone(claims):
+    older, newer = claims.claim("one", 1, 0.0), claims.claim("one", 1, HOUR_S)
+    assert (older.attempt, newer.attempt) == (1, 2)
+    before = claims.all()
+    assert not claims.record(older, [SeedRun(seed=0)])
+    assert not claims.settle(older, result(values=[1.0]))
+    assert claims.all() == before
+    assert claims.settle(newer, result("FAIL"))
+
+
 def test_a_second_result_is_accepted_and_the_first_one_stays(claims):
     claim = claims.claim("one", 1, HOUR_S)
     first = result(values=[12.5], ending="finished")

@@ -1,5 +1,6 @@
 """Trials made by a worker in a real database, without their trainings."""
 
+import contextlib
 import time
 from types import SimpleNamespace
 
@@ -12,7 +13,7 @@ from deepracer_exp.config.compose import compose_evaluation, compose_experiment
 from deepracer_exp.config.sweep import compose_sweep
 from deepracer_exp.reports.pages import run_page
 from deepracer_exp.sweeps.queue.claims import TrialClaims
-from deepracer_exp.sweeps.queue.storage import open_storage
+from deepracer_exp.sweeps.queue.storage import Database, open_storage
 from deepracer_exp.sweeps.queue.study import open_study
 from deepracer_exp.sweeps.queue.trial_run import TrialRun
 from deepracer_exp.sweeps.queue.worker import Worker
@@ -96,6 +97,23 @@ def test_a_worker_lost_before_it_created_its_trial_leaves_no_gap_and_changes_no_
     assert [claim.attempt for claim in claims.all()] == [2, 1, 1, 1]
     assert [Trial.of(trial) for trial in trials] == [claim.trial for claim in claims.all()]
     assert [trial.params for trial in trials] == [trial.params for trial in undisturbed]
+
+
+def test_a_trial_that_another_worker_creates_meanwhile_is_not_created_again(tmp_path, monkeypatch):
+    one, storage = worker(
+        tmp_path, "algorithm.lr=interval(1e-5,1e-3)", "sweep.sampler=random", "sweep.trials=2"
+    )
+    study_id = storage.get_study_id_from_name("s")
+    created: list[int] = []
+
+    @contextlib.contextmanager
+    def waited_for(*_: object):
+        created.append(storage.create_new_trial(study_id))
+        yield
+
+    monkeypatch.setattr(Database, "creation_lock", waited_for)
+    assert [one._trial_id(0)] == created
+    assert storage.get_n_trials(study_id) == 1
 
 
 def test_a_run_whose_trial_is_taken_over_while_its_pictures_are_drawn_has_no_end(tmp_path, monkeypatch):
