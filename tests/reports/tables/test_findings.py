@@ -117,6 +117,14 @@ def test_episodes_under_way_when_the_run_ended_do_not_count() -> None:
     assert not view.episodes["ended"].iloc[-1]
 
 
+def test_an_episode_belongs_to_the_iteration_in_which_it_ended() -> None:
+    recording = made_up_recording([Drive(speed_mps=3.0, iteration=k) for k in (1, 2)])
+    begun_before = recording.steps["steps"] < 20
+    steps = recording.steps.assign(iteration=recording.steps["iteration"] - begun_before)
+    view = prepare(replace(recording, steps=steps))
+    assert view.episodes["iteration"].tolist() == [1, 2]
+
+
 @cache
 def laps_of(*iterations: tuple[int, int, float]) -> LogView:
     """Prepare a training of iterations with complete laps, episodes that run off, and the laps' speed."""
@@ -130,9 +138,10 @@ def laps_of(*iterations: tuple[int, int, float]) -> LogView:
 
 
 def test_the_fast_and_dense_iteration_is_to_be_submitted() -> None:
-    # Fast but rare, dense but slow, and both; the fourth has too few laps to have a percentile.
-    view = laps_of((3, 7, 3.0), (10, 0, 2.0), (8, 2, 2.5), (2, 0, 3.0))
-    assert view.candidates["iteration"].tolist() == [2, 1]
+    # The untrained one; dense but slow, fast and dense, fast but rare; too few laps for a percentile, and just enough.
+    counts = (0, 5, 3.0), (10, 0, 2.0), (8, 2, 2.5), (3, 7, 3.0), (2, 0, 3.0), (3, 0, 1.8)
+    view = laps_of(*counts, (8, 0, 1.5))  # in a short last iteration the job ended
+    assert view.candidates["iteration"].tolist() == [2, 1, 5]
     found = of(view, "submit")
     assert found.sentence.startswith("Submit the checkpoint (its name is not logged")
     assert "8 of its 10 episodes are complete laps (49% to 94% with 95% confidence)" in found.sentence
