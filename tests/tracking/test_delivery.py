@@ -5,9 +5,16 @@ import json
 import pytest
 
 from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.runs.labels import Labels
 from deepracer_exp.runs.run_files import read_run_id
 from deepracer_exp.tracking.calls import StoreRefusedError
-from deepracer_exp.tracking.delivery import deliver, deliver_evaluation, is_delivered
+from deepracer_exp.tracking.delivery import (
+    deliver,
+    deliver_evaluation,
+    deliver_labels,
+    is_delivered,
+    recorded_labels,
+)
 from deepracer_exp.tracking.mlflow_run import MLflowRun
 from deepracer_exp.tracking.store import Store
 from deepracer_exp.tracking.tracking_file import TrackedRun, read_tracked_run
@@ -85,6 +92,17 @@ def test_a_run_deleted_in_mlflow_is_refused(run_dir, store, mlflow, tmp_path):
     (run_dir / "summary.json").unlink()
     with pytest.raises(BadInput, match="has not ended"):
         deliver(run_dir, store.uri, tmp_path)
+
+
+def test_a_note_and_tags_that_were_removed_are_removed_in_mlflow(store, mlflow, tmp_path):
+    run_id = mlflow.create_run("0", tags={"own": "1"}).info.run_id
+    for labels in (
+        Labels("blue", "fast", {"car": "red", "tyres": "new"}),
+        Labels("blue", None, {"car": "red"}),
+    ):
+        deliver_labels(run_id, labels, store.uri, tmp_path)
+        assert recorded_labels(run_id, store.uri, tmp_path) == labels
+    assert mlflow.get_run(run_id).data.tags["own"] == "1"
 
 
 def test_an_evaluation_and_its_film_reach_the_run_in_mlflow(run_dir, store, mlflow, tmp_path, away, caplog):

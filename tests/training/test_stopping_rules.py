@@ -137,6 +137,13 @@ def test_each_rule_ends_the_run_that_it_is_for(name, rows, at, within):
     assert_reported(decision)
 
 
+def test_laps_are_judged_by_no_more_evaluations_than_an_average_is_of():
+    patience = 5 * rule().window  # every fifth iteration is evaluated
+    rows = slowing(lap_time_s=lambda i: 6.0 if i < 105 else 7.0)
+    number, decision = stopped_at(rows, rule(f"stopping.laps_slower.patience={patience}"))
+    assert (decision.rule, number) == ("laps_slower", 104 + patience)
+
+
 @pytest.mark.parametrize(
     "rows",
     {
