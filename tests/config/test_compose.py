@@ -252,6 +252,7 @@ def test_ranges_and_choices_are_lists():
     assert expand_grid(["seed=choice(5,7)"]) == [["seed=5"], ["seed=7"]]
     assert expand_grid(["seed=3"]) == [["seed=3"]]
     assert expand_grid([]) == [[]]
+    assert len(expand_grid(["seed=range(1000)"])) == 1000
     for many in (["seed=range(1001)"], [f"seed={','.join(map(str, range(40)))}", "name=range(40)"]):
         with pytest.raises(BadInput, match="more than 1,000 runs"):
             expand_grid(many)

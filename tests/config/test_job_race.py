@@ -124,3 +124,8 @@ def test_what_a_recording_s_parameters_leave_open_is_not_known():
     # The distance between boxes that are spread depends on the version of the service.
     assert recorded_race({"NUMBER_OF_OBSTACLES": "4"}) is None
     assert recorded_race({}) is None
+
+
+def test_a_box_at_the_end_of_the_lap_is_one_at_its_beginning():
+    race = recorded_race({"OBJECT_POSITIONS": "1.0,-1;0,1"})
+    assert [(box.lap, box.lane) for box in race.boxes.positions] == [(0.0, "outer"), (0.0, "inner")]
