@@ -1,6 +1,5 @@
 """Lines of every generation, and what of a damaged file can still be read."""
 
-import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from deepracer_exp.aws.logs.recorded import Recording
 from deepracer_exp.errors import BadInput
 from tests.conftest import refused
 from tests.examples import examples
+from tests.memory import traced
 
 from . import made_up_logs as made
 
@@ -286,12 +286,10 @@ def test_a_large_log_with_few_trace_lines_takes_little_memory(tmp_path):
             file.write(noise)
             if number % 30 == 0:
                 file.write(made.log_text(ROWS.assign(episode=ROWS["episode"] + number)).encode())
-    tracemalloc.start()
-    recording = read_recording(log)
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
+    with traced() as peak:
+        recording = read_recording(log)
+        assert peak() < 60e6
     assert len(recording.steps) == 3 * len(ROWS)
-    assert peak < 60e6
 
 
 def test_a_line_without_end_is_skipped_and_reported(tmp_path):

@@ -12,9 +12,9 @@ from deepracer_exp.runs import clean
 from deepracer_exp.runs.checkpoint_files import pin
 from deepracer_exp.tracking.delivery import undelivered
 from deepracer_exp.tracking.store import resolve_store
-from tests.tracking.conftest import Season, client, empty_database, free_port, season, server
+from tests.tracking.conftest import Season, client, free_port, season, server
 
-__all__ = ["client", "empty_database", "free_port", "season", "server"]
+__all__ = ["client", "free_port", "season", "server"]
 
 
 @pytest.fixture

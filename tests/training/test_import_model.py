@@ -6,7 +6,6 @@ import io
 import json
 import random
 import tarfile
-import tracemalloc
 import zipfile
 
 import numpy as np
@@ -28,6 +27,7 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.checkpoints import read_checkpoint
 from deepracer_exp.runs.stored_run import StoredRun
 from tests.conftest import IN_PROCESS
+from tests.memory import traced
 
 NAME = "11_Step-38428.ckpt"
 INDEX, DATA = f"model/{NAME}.index", f"model/{NAME}.data-00000-of-00001"
@@ -325,12 +325,10 @@ def test_two_hundred_damaged_archives_are_refused_within_bounded_memory(call, tm
     packed = sum(value.nbytes for value in light.values())
     for seed in range(KINDS.index(kind), 200, len(KINDS)):
         assert_nothing_is_made_of(damaged(kind, seed, light), call, tmp_path)
-        tracemalloc.start()
-        with contextlib.suppress(BadInput):
-            read_model(str(tmp_path / "model.tar.gz"), "best")
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        assert peak < packed + 2**26, f"{peak / 2**20:.0f} MiB"
+        with traced() as peak:
+            with contextlib.suppress(BadInput):
+                read_model(str(tmp_path / "model.tar.gz"), "best")
+            assert peak() < packed + 2**26
 
 
 def actions(networks, frames):
