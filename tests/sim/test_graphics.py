@@ -9,7 +9,7 @@ import pytest
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="names of libraries on Linux")
 
-LIBRARIES = ("bogus", "osmesa", "glfw", "egl", "disable", "")
+LIBRARIES = ("bogus", "glfw", "disable", "")
 STEP = """
 import deepracer_exp.sim.batch
 from deepracer_exp.evaluation.video import can_draw
