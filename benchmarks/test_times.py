@@ -33,7 +33,7 @@ def slowest(report: Path, files: int) -> tuple[str, str]:
     seconds: dict[str, float] = defaultdict(float)
     tests: Counter[str] = Counter()
     for case in suite.iter("testcase"):
-        module = case.get("classname", "").removeprefix("tests.").replace(".", "/")
+        module = f"{case.get('classname', '').replace('.', '/')}.py"
         seconds[module] += float(case.get("time", 0.0))
         tests[module] += 1
     tests_s = sum(seconds.values())

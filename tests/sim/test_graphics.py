@@ -62,7 +62,8 @@ def ended(tmp_path_factory):
     calls = [*((library, STEP) for library in LIBRARIES), ("bogus", FILM)]
     env = {key: value for key, value in os.environ.items() if key != "DISPLAY"}
     done = subprocess.run(
-        [sys.executable, "-c", FORKS, json.dumps(calls)],
+        # From Python 3.12 on, a fork of a process with threads is warned of.
+        [sys.executable, "-W", "ignore::DeprecationWarning:__main__", "-c", FORKS, json.dumps(calls)],
         cwd=folder, env=env, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert (done.returncode, done.stderr) == (0, "")
