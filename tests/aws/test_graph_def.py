@@ -128,10 +128,9 @@ def _reshapes(tensors):
 
 def test_a_damaged_graph_is_refused_in_one_line_or_has_the_same_tensors():
     content, shapes = graph(), {name: value.shape for name, value in weights().items()}
-    random = np.random.default_rng(1)
-    refusals = []
-    read_weights("model.pb", content)
-    with traced() as peak:
+
+    def refused_of_sixty() -> list[str]:
+        random, refusals = np.random.default_rng(1), []
         for number in range(60):
             damaged = bytearray(content)
             if number % 3 == 0:
@@ -146,9 +145,15 @@ def test_a_damaged_graph_is_refused_in_one_line_or_has_the_same_tensors():
                 refusals.append(str(error))
             else:
                 assert all(value.shape == shapes.get(name, value.shape) for name, value in read.items())
-        assert peak() < 20 * len(content)
+        return refusals
+
+    # What a process takes once, for imports and regular expressions, is no memory of the reader.
+    refusals = refused_of_sixty()
     assert len(refusals) > 20
     assert all(line.startswith("model.pb: ") and "accepted: a frozen graph" in line for line in refusals)
+    with traced() as peak:
+        refused_of_sixty()
+        assert peak() < 20 * len(content)
 
 
 def tensor(

@@ -38,7 +38,7 @@ def test_no_password_of_an_address_is_shown_and_each_is_known_again(password, ad
     [
         ("http://host:5000/a@b", "http://host:5000/a@b"),
         ("http://me:s3cr/t@host:5000", "http://host:5000"),
-        ("postgresql+psycopg://me@host/db", "postgresql+psycopg://me@host/db"),
+        ("postgresql+psycopg://you@host/db", "postgresql+psycopg://you@host/db"),
         ("postgresql+psycopg://me:s3cr3t word@host/db", "postgresql+psycopg://me@host/db"),
         ("postgresql:///db?user=me&password=s3cr3t&host=/run/pg", "postgresql:///db?user=me&host=/run/pg"),
         ("postgresql:///db?password=s3cr3t", "postgresql:///db"),
