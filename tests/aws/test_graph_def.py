@@ -16,7 +16,7 @@ from deepracer_exp.aws.models.graph_def import (
 from deepracer_exp.aws.models.protobuf import field, read_fields
 from deepracer_exp.errors import BadInput
 from tests.conftest import REFERENCE, refused
-from tests.memory import traced
+from tests.memory import peak_of
 
 MODEL = REFERENCE / "aws_checkpoint" / "model"
 SENSORS = {"STEREO_CAMERAS": (20, 24, 2), "LIDAR": (6,)}
@@ -128,32 +128,28 @@ def _reshapes(tensors):
 
 def test_a_damaged_graph_is_refused_in_one_line_or_has_the_same_tensors():
     content, shapes = graph(), {name: value.shape for name, value in weights().items()}
+    random = np.random.default_rng(1)
+    refusals = []
 
-    def refused_of_sixty() -> list[str]:
-        random, refusals = np.random.default_rng(1), []
-        for number in range(60):
-            damaged = bytearray(content)
-            if number % 3 == 0:
-                del damaged[random.integers(len(content)) :]
-            else:
-                at = random.integers(len(content), size=1 + number % 5)
-                for place, byte in zip(at.tolist(), random.integers(256, size=len(at)).tolist(), strict=True):
-                    damaged[place] = byte
-            try:
-                read = read_weights("model.pb", bytes(damaged))
-            except BadInput as error:
-                refusals.append(str(error))
-            else:
-                assert all(value.shape == shapes.get(name, value.shape) for name, value in read.items())
-        return refusals
+    def read_damaged() -> None:
+        try:
+            read = read_weights("model.pb", bytes(damaged))
+        except BadInput as error:
+            refusals.append(str(error))
+        else:
+            assert all(value.shape == shapes.get(name, value.shape) for name, value in read.items())
 
-    # What a process takes once, for imports and regular expressions, is no memory of the reader.
-    refusals = refused_of_sixty()
-    assert len(refusals) > 20
+    for number in range(60):
+        damaged = bytearray(content)
+        if number % 3 == 0:
+            del damaged[random.integers(len(content)) :]
+        else:
+            at = random.integers(len(content), size=1 + number % 5)
+            for place, byte in zip(at.tolist(), random.integers(256, size=len(at)).tolist(), strict=True):
+                damaged[place] = byte
+        assert peak_of(read_damaged) < 20 * len(content)
+    assert len(refusals) > 2 * 20
     assert all(line.startswith("model.pb: ") and "accepted: a frozen graph" in line for line in refusals)
-    with traced() as peak:
-        refused_of_sixty()
-        assert peak() < 20 * len(content)
 
 
 def tensor(
