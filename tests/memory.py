@@ -16,13 +16,3 @@ def traced() -> Iterator[Callable[[], int]]:
         yield lambda: tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-
-
-def peak_of(call: Callable[[], object]) -> int:
-    """Return how many bytes a call takes at most, made twice: the smaller, since other threads take some, too."""
-    peaks = []
-    for _ in range(2):
-        with traced() as peak:
-            call()
-            peaks.append(peak())
-    return min(peaks)
