@@ -1,39 +1,75 @@
-"""Run the tests that start processes, wait or read a clock again and again beside twelve busy processes.
+"""Which tests a busy machine could fail, and a machine that is busy to run them on.
 
     python -m tests.busy_machine [--times 20] [--busy 12] [PYTEST_ARGUMENT...]
 
-Each time in another order of the modules. The exit code is that of the first run that failed; none is repeated.
+runs those that start processes, wait or read a clock twenty times beside twelve processes that compute, each time in
+another order of the modules. It ends with the exit code of the first run that fails.
 """
 
 import argparse
+import inspect
 import subprocess
 import sys
+from types import CodeType, FunctionType, ModuleType
+from typing import Any
+
+import pytest
+
+_OUTSIDE = {
+    "multiprocessing",
+    "psutil",
+    "signal",
+    "socket",
+    "subprocess",
+    "threading",
+    "time",
+    "tests.waiting",
+}
+"""Modules of what starts a process, waits, or reads a clock."""
+_TESTS = "processes and not slow and not faults"
+
+
+def depends_on_the_machine(item: pytest.Item) -> bool:
+    """Return whether a test, or one of its fixtures, uses a module of `_OUTSIDE`."""
+    rooms = [item.module]
+    package = item.module.__name__
+    while package := package.rpartition(".")[0]:
+        if conftest := sys.modules.get(f"{package}.conftest"):
+            rooms.append(conftest)
+    fixtures = [getattr(room, name, None) for name in item.fixturenames for room in rooms]
+    return any(_goes_outside(used, set()) for used in (item.function, *fixtures))
+
+
+def _goes_outside(used: Any, seen: set[int]) -> bool:
+    """Return whether a function, class or fixture of the tests, or one that it names, does."""
+    used = inspect.unwrap(used)
+    if id(used) in seen:
+        return False
+    seen.add(id(used))
+    if (used.__name__ if isinstance(used, ModuleType) else getattr(used, "__module__", None)) in _OUTSIDE:
+        return True
+    if isinstance(used, type) and used.__module__.startswith("tests."):
+        return any(_goes_outside(method, seen) for method in vars(used).values())
+    if isinstance(used, FunctionType) and used.__module__.startswith("tests."):
+        return any(_goes_outside(used.__globals__.get(name), seen) for name in _names(used.__code__))
+    return False
+
+
+def _names(code: CodeType) -> set[str]:
+    return set(code.co_names).union(*(_names(one) for one in code.co_consts if isinstance(one, CodeType)))
 
 
 def main() -> int:
     """Run them; print a line a run."""
     parser = argparse.ArgumentParser(prog="python -m tests.busy_machine", description=__doc__)
     parser.add_argument("--times", type=int, default=20)
-    parser.add_argument(
-        "--busy", type=int, default=12, help="processes beside them that compute all the time"
-    )
+    parser.add_argument("--busy", type=int, default=12, help="processes that compute all the time")
     options, arguments = parser.parse_known_args()
+    pytest_line = [sys.executable, "-m", "pytest", "-q", "-m", _TESTS, "-n", "2", "--dist", "worksteal"]
     busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(options.busy)]
     try:
         for turn in range(1, options.times + 1):
-            order = f"--random-order-seed={turn}"
-            tests = [
-                "-q",
-                "-m",
-                "processes and not slow and not faults",
-                "-n",
-                "2",
-                "--dist",
-                "worksteal",
-                order,
-                *arguments,
-            ]
-            done = subprocess.run([sys.executable, "-m", "pytest", *tests], check=False)
+            done = subprocess.run([*pytest_line, f"--random-order-seed={turn}", *arguments], check=False)
             print(f"{turn} of {options.times}: exit code {done.returncode}", flush=True)
             if done.returncode:
                 return done.returncode

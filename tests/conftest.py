@@ -5,7 +5,6 @@ import contextlib
 import functools
 import gc
 import hashlib
-import inspect
 import io
 import json
 import os
@@ -19,7 +18,6 @@ import uuid
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 import psutil
@@ -31,6 +29,7 @@ from deepracer_exp.cli import main
 from deepracer_exp.errors import BadInput
 
 from .browser import chromium, tab
+from .busy_machine import depends_on_the_machine
 from .postgres import postgres, postgres_server
 from .waiting import PATIENCE_S
 
@@ -68,50 +67,12 @@ def pytest_collection_finish() -> None:
     gc.set_threshold(50_000, 20, 20)
 
 
-_OUTSIDE = {
-    "multiprocessing",
-    "psutil",
-    "signal",
-    "socket",
-    "subprocess",
-    "threading",
-    "time",
-    "tests.waiting",
-}
-"""Modules of what starts a process, waits, or reads a clock."""
-
-
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests whose outcome could depend on how busy the machine is; others are marked where they stand."""
     for item in items:
-        rooms = [item.module]
-        package = item.module.__name__
-        while package := package.rpartition(".")[0]:
-            if conftest := sys.modules.get(f"{package}.conftest"):
-                rooms.append(conftest)
-        fixtures = [getattr(room, name, None) for name in item.fixturenames for room in rooms]
-        if any(_goes_outside(used, set()) for used in (item.function, *fixtures)):
+        if depends_on_the_machine(item):
             item.add_marker("processes")
-
-
-def _goes_outside(used: Any, seen: set[int]) -> bool:
-    """Return whether a function, class or fixture of the tests, or one that it names, uses a module of `_OUTSIDE`."""
-    used = inspect.unwrap(used)
-    if id(used) in seen:
-        return False
-    seen.add(id(used))
-    if (used.__name__ if isinstance(used, ModuleType) else getattr(used, "__module__", None)) in _OUTSIDE:
-        return True
-    if isinstance(used, type) and used.__module__.startswith("tests."):
-        return any(_goes_outside(method, seen) for method in vars(used).values())
-    if isinstance(used, FunctionType) and used.__module__.startswith("tests."):
-        return any(_goes_outside(used.__globals__.get(name), seen) for name in _names(used.__code__))
-    return False
-
-
-def _names(code: CodeType) -> set[str]:
-    return set(code.co_names).union(*(_names(one) for one in code.co_consts if isinstance(one, CodeType)))
 
 
 _MARK = "DEEPRACER_EXP_STARTED_BY"

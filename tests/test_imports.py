@@ -21,15 +21,15 @@ from .training.conftest import workers_start_early  # noqa: F401 - a fixture
 
 # The server ignores a name that is none, and each worker would import for seconds while the training waits.
 def test_all_that_workers_are_to_be_forked_with_is_there(monkeypatch):
-    told: list[str] = []
+    preloaded: list[str] = []
     monkeypatch.setattr(multiprocessing, "set_start_method", lambda *_, **__: None)
-    monkeypatch.setattr(multiprocessing, "set_forkserver_preload", told.extend)
+    monkeypatch.setattr(multiprocessing, "set_forkserver_preload", preloaded.extend)
     monkeypatch.setattr(forkserver, "ensure_running", lambda: None)
     start_workers_early(True)
-    assert car_worker.__name__ in told
+    assert car_worker.__name__ in preloaded
     start_workers_early(True, train._WORKER)
-    assert worker.__name__ in told
-    assert [name for name in told if importlib.util.find_spec(name) is None] == []
+    assert worker.__name__ in preloaded
+    assert [name for name in preloaded if importlib.util.find_spec(name) is None] == []
 
 
 @pytest.mark.usefixtures("workers_start_early")

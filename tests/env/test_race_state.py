@@ -129,7 +129,7 @@ def test_a_car_that_was_reversed_for_ten_steps_ends_its_episode_after_five_more(
 
 
 def test_a_car_that_stands_ends_its_episode_in_the_same_step_although_its_race_was_interrupted():
-    # A car that is told to stand rolls some millimetres a step.
+    # At a commanded speed of 0 a car rolls a few millimetres a step.
     setup = make_setup("action_space=continuous", "action_space.speed.low=0", "episode.immobilized_m=0.01")
     before, after = Race(setup, 1), Race(setup, 1)
 

@@ -161,7 +161,7 @@ def test_ctrl_c_of_a_sweep_in_this_process_leaves_its_trials_ready_to_resume(cal
 
 
 def assert_those_under_way_can_be_resumed(cwd):
-    """Return how many trials would begin none anew."""
+    """Return how many trials the study has if no other one begins."""
     begun = claims(cwd)
     assert {claim.attempt for claim in begun} == {1}
     open_ones = [claim for claim in begun if not claim.has_ended]

@@ -67,7 +67,7 @@ def assert_as_if_nothing_had_happened(tmp_path, start):
 
 @pytest.mark.usefixtures("workers_start_early")
 def test_a_training_killed_in_the_middle_of_an_iteration_is_resumed_bit_for_bit(call, tmp_path):
-    """Its reward function kills it, once, so that the moment is the same on every machine."""
+    """The reward function kills the process once, at the same step on every machine."""
     (tmp_path / "deadly.py").write_text(
         "import os, pathlib\n\n\n"
         "def reward_function(params):\n"

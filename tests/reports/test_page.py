@@ -103,7 +103,7 @@ class Drawn:
     last_in_sight: list[str | None]
     """State of the last figure that is not folded, before it came into sight and then."""
     contents: dict[str, bool]
-    """Of the contents at the end of the page."""
+    """What the table of contents shows, read at the end of the page."""
     background: str
     contrasts: dict[str, float]
     """Of what is to be read, by element, its colour and what is behind it."""
