@@ -2,7 +2,8 @@
 
     python -m benchmarks.throughput [--seconds 3] [--rounds 7] [--cars 256] [--json FILE] [OVERRIDE...]
 
-A step is one control step (1/15 s) of one car. Everything is the default experiment unless overridden.
+A step is one control step (1/15 s) of one car. Everything is the default experiment unless overridden; physics and
+environment are measured with cars that are alike (`randomization=none`).
 
 - `physics_steps_per_s`: `CarBatch.drive` alone, tyres and MuJoCo, one thread, 256 cars. It gets exactly the commands
   and starts of the next figure's driving and is checked to end in the same state; only the time inside the call
@@ -182,9 +183,11 @@ class _Noting:
 
 def driving(overrides: Sequence[str], n_cars: int, rounds: int, seconds: float) -> Rates:
     """Measure physics and environment, and the environment on all tracks."""
-    same = SameDriving(compose_experiment(overrides)[0], n_cars)
+    # Cars that differ become others with each episode, which the physics alone would not see.
+    alike = ("randomization=none", *overrides)
+    same = SameDriving(compose_experiment(alike)[0], n_cars)
     everywhere = SameDriving(
-        compose_experiment([*overrides, f"track=[{','.join(TRACKS)}]", f"collector.cars={n_cars}"])[0], n_cars
+        compose_experiment([*alike, f"track=[{','.join(TRACKS)}]", f"collector.cars={n_cars}"])[0], n_cars
     )
     return in_turns(
         rounds,

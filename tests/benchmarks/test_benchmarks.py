@@ -57,6 +57,14 @@ def test_throughput_reports_the_documented_figures_and_holds_the_training_agains
     assert "wanted" in throughput.show(summary)
 
 
+def test_the_physics_alone_drives_what_the_cars_of_the_default_experiment_drove(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(throughput, "TRACKS", ("reinvent_base", "Oval_track"))
+    rates = throughput.driving([], n_cars=4, rounds=1, seconds=0.0)
+    assert set(rates) == {"physics", "env", "env, all tracks"}
+
+
 @pytest.mark.slow
 def test_time_to_lap_writes_its_figures_for_each_seed(tmp_path: Path) -> None:
     file = tmp_path / "lap.json"
