@@ -41,7 +41,7 @@ OBJECT_COLUMNS = (
 """The keys about boxes and bots, one row per car: of K others (N, K), `objects_location` (N, K, 2); `is_crashed` and
 `object_in_camera` (N,), `closest_objects` (N, 2). Columns have them only where there are others."""
 MASK = "objects_mask"
-"""The further key of `reward_batch`: which entries of the arrays about others are others, (N, K); all others of a car
+"""The extra key of `reward_batch`: the mask of the filled entries in the arrays about others, (N, K); those of a car
 come first."""
 
 

@@ -56,6 +56,7 @@ class RewardFunction:
         time_limit_s: Seconds of CPU for all calls of one step (see `TimeLimit` for where it holds).
         prints: Where `print` goes; None discards it.
         scalar: Call `reward_function` even where the module has `reward_batch`.
+        first_car: Number of the first car over all processes, as prints and errors name it.
 
     Attributes:
         is_batch: Whether `reward_batch` is called for all cars at once.
@@ -72,10 +73,12 @@ class RewardFunction:
         time_limit_s: float,
         prints: RewardPrints | None,
         scalar: bool = False,
+        first_car: int = 0,
     ) -> None:
         self.source = source
         self.n_cars = n_cars
         self.time_limit_s = time_limit_s
+        self._first_car = first_car
         code = compile(source_with_constants(source), source.path, "exec", dont_inherit=True)
         # Names that the module binds at its top level are listed in its code.
         self.is_batch = not scalar and "reward_batch" in code.co_names
@@ -135,7 +138,9 @@ class RewardFunction:
     def _load(
         self, code: CodeType, name: str, prints: RewardPrints | None, car: int | None
     ) -> Callable[[dict[str, Any]], object]:
-        printer = _discard if prints is None else prints.printer(car)
+        printer = (
+            _discard if prints is None else prints.printer(None if car is None else self._first_car + car)
+        )
         namespace: dict[str, Any] = {
             "__name__": "reward_function",
             "__file__": self.source.path,
@@ -216,7 +221,8 @@ class RewardFunction:
     def _fail(self, error: BaseException, car: int | None, params: dict[str, Any]) -> NoReturn:
         """Raise RewardFailed for an error of the function."""
         function = "reward_batch" if self.is_batch else "reward_function"
-        where = f"{len(params['steps'])} cars" if car is None else f"car {car}, step {params['steps']:g}"
+        number = None if car is None else self._first_car + car
+        where = f"{len(params['steps'])} cars" if car is None else f"car {number}, step {params['steps']:g}"
         what = what_happened(error, self.source.path)
         message = f"reward {self.source.name}: {function} {what} ({where})"
         raise RewardFailed(message, params, car, what) from error

@@ -27,6 +27,34 @@ class RewardSource:
     """The values that replace them."""
 
 
+def keeps_state(source: RewardSource) -> bool:
+    """Return whether a function that a training calls assigns to a variable of its module, or into one."""
+    module = ast.parse(source.text)
+    functions = {node.name: node for node in module.body if isinstance(node, ast.FunctionDef)}
+    called = [name for name in ("reward_batch", "reward_function") if name in functions][:1]
+    for name in called:  # and those that they name
+        named = {node.id for node in ast.walk(functions[name]) if isinstance(node, ast.Name)}
+        called += sorted(named & functions.keys() - {*called})
+    bound = {
+        node.name if isinstance(node, ast.ClassDef) else node.id
+        for statement in module.body
+        if not isinstance(statement, ast.FunctionDef)
+        for node in ast.walk(statement)
+        if isinstance(node, ast.ClassDef) or (isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store))
+    }
+    return any(
+        isinstance(node, ast.Global)
+        or (
+            isinstance(node, ast.Attribute | ast.Subscript)
+            and isinstance(node.ctx, ast.Store)
+            and isinstance(node.value, ast.Name)
+            and node.value.id in bound
+        )
+        for name in called
+        for node in ast.walk(functions[name])
+    )
+
+
 _ZOO = "reward_zoo"
 
 NO_REWARD = RewardSource(

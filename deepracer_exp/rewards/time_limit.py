@@ -9,7 +9,7 @@ from typing import Any, Self
 _LOOKS = 4
 """Number of checks within the time limit."""
 _WAIT_FACTOR = 10
-"""Limit of waiting without CPU use, as in `sleep`, as a multiple of the limit of CPU time."""
+"""Wall-clock limit of code that waits, as in `sleep`, as a multiple of the CPU limit."""
 
 
 def run_module(code: CodeType, namespace: dict[str, Any]) -> None:

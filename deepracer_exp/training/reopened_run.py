@@ -1,6 +1,5 @@
-"""A run taken up again from its last checkpoint."""
+"""Resuming a run from its last checkpoint."""
 
-import ast
 import logging
 import math
 from collections.abc import Mapping, Sequence
@@ -17,6 +16,7 @@ from deepracer_exp.config.running import BudgetConfig
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.rival_run import kept_rival
+from deepracer_exp.rewards.source import keeps_state
 from deepracer_exp.runs.checkpoints import check, checkpoint_name, intact_checkpoint, read_training
 from deepracer_exp.runs.fingerprint import refuse_changes
 from deepracer_exp.runs.folder import RunFolder
@@ -157,8 +157,6 @@ def _differences_to_uninterrupted(experiment: Experiment, setup: RaceSetup) -> l
     algorithm = experiment.algorithm
     if by_clock and isinstance(algorithm, PPOConfig) and algorithm.entropy_end_factor != 1:
         why.append("the entropy bonus follows the clock (budget.minutes, algorithm.entropy_end_factor)")
-    if any(isinstance(node, ast.Global) for node in ast.walk(ast.parse(setup.reward.text))):
-        why.append(
-            f"the reward function {setup.reward.name} keeps something in a global variable, which is lost"
-        )
+    if keeps_state(setup.reward):
+        why.append(f"the reward function {setup.reward.name} remembers earlier calls, which are lost")
     return why

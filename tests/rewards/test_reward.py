@@ -339,6 +339,16 @@ def test_a_bad_batch_fails_the_run_in_one_line(body: str, car: int | None, messa
         assert str(error).endswith(f"(car {car}, step 7)")
 
 
+def test_a_car_has_its_number_over_all_processes_in_errors_and_prints(tmp_path: Path) -> None:
+    text = "def reward_function(params):\n    print(params['x'])\n    return 1 / (params['x'] - 1)\n"
+    source = RewardSource("mine", "/somewhere/mine.py", text, "0" * 64, {}, {})
+    prints = RewardPrints(tmp_path / "prints.log")
+    error = failure(RewardFunction(source, 3, 5.0, prints, first_car=128))
+    assert str(error).endswith("(car 129, step 7)")
+    assert error.car == 1
+    assert (tmp_path / "prints.log").read_text().splitlines() == ["car 128: 0.0", "car 129: 1.0"]
+
+
 def test_a_batch_function_that_mutates_its_params_changes_nothing_outside() -> None:
     reward = batch(
         "total = params['x'] + params['waypoints'].sum();"

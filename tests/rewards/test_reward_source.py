@@ -1,4 +1,5 @@
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,8 +9,10 @@ from hypothesis import strategies as st
 from deepracer_exp.config.driving import RewardConfig
 from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.source import (
+    NO_REWARD,
     RewardSource,
     is_of_zoo,
+    keeps_state,
     load_reward_source,
     source_with_constants,
     zoo_names,
@@ -142,3 +145,35 @@ def test_a_function_of_the_zoo_is_known_by_its_text_whatever_its_constants() -> 
     assert not is_of_zoo(source.text + "\nprint('hello')\n")
     assert not is_of_zoo(PLAIN)
     assert not is_of_zoo("no Python at all")
+
+
+@pytest.mark.parametrize(
+    ("module", "answer"),
+    [
+        ("def reward_function(params):\n    last = params['x']\n    return last\n", False),
+        (
+            "last = 0.0\ndef reward_function(params):\n    global last\n    last = 1.0\n    return last\n",
+            True,
+        ),
+        ("_last = {}\ndef reward_function(params):\n    _last['x'] = 1.0\n    return 1.0\n", True),
+        (
+            "class Before:\n    x = None\n"
+            "def reward_function(params):\n    Before.x = params['x']\n    return 1.0\n",
+            True,
+        ),
+        ("LIMIT = 2.0\ndef reward_function(params):\n    params['x'] = LIMIT\n    return 1.0\n", False),
+        (
+            "_last = {}\ndef gained(params):\n    _last['x'] = 1.0\n"
+            "def reward_function(params):\n    return gained(params)\n",
+            True,
+        ),
+        # A training calls the batch alone.
+        (
+            "_last = {}\ndef reward_function(params):\n    _last['x'] = 1.0\n    return 1.0\n"
+            "def reward_batch(params):\n    return params['previous_progress']\n",
+            False,
+        ),
+    ],
+)
+def test_a_function_that_remembers_earlier_calls_is_known(module: str, answer: bool) -> None:
+    assert keeps_state(replace(NO_REWARD, text=module)) is answer

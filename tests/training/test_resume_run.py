@@ -354,7 +354,7 @@ def test_a_reward_function_with_a_memory_is_reported_and_one_that_was_changed_re
     run = copied(*OFTEN, f"reward.file={file}", "budget.iterations=2")
     ended = call("resume", run.name, "budget.iterations=3")
     assert ended.code == 0
-    assert "will not be that of an uninterrupted run: the reward function memory keeps" in ended.stderr
+    assert "will not be that of an uninterrupted run: the reward function memory remembers" in ended.stderr
     file.write_text(reward.replace("1.0", "2.0"))
     call("resume", run.name, "budget.iterations=4").assert_refused("reward memory has other contents")
 
