@@ -66,6 +66,19 @@ def test_commands_stay_within_the_limits(lap):
     assert lap.column("commanded_mps").max() <= 4.0 + 1e-9
 
 
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("observation=camera_small", "network=cnn_small"),
+        ("race=object_avoidance", "race.boxes.number=1", "observation.next_objects=1"),
+    ],
+    ids=" ".join,
+)
+def test_the_lap_of_a_run_among_others_or_with_a_camera_is_driven_alone_and_blind(lap, overrides):
+    commands = np.column_stack([lap.column("commanded_mps"), np.radians(lap.column("steering_deg"))])
+    np.testing.assert_allclose(question(*overrides)._drive(commands[1:-1]), lap.steps, atol=1e-9)
+
+
 def test_a_lap_is_searched_once(lap, cache, monkeypatch):
     monkeypatch.setattr(Question, "answer", lambda *_: pytest.fail("searched again"))
     again = fastest_lap(question())

@@ -36,7 +36,7 @@ from .lap_search import OnRound, Search, lap_time_s
 Floats = NDArray[np.float64]
 
 ALGORITHM = 3
-"""Laps that an earlier version found are searched again."""
+"""Version of the search; laps found by an earlier one are searched again."""
 COLUMNS = ("time_s", "x_m", "y_m", "yaw_rad", "speed_mps", "progress", "steering_deg", "commanded_mps")
 """Columns of a lap's steps: clock, front point, heading, speed, per cent of the lap, and the command given there."""
 _TRACED = ("tstamp", "X", "Y", "yaw", "speed_mps", "progress", "steer", "throttle")
@@ -167,15 +167,17 @@ class Question:
     def _drive(self, commands: Floats) -> Floats:
         """Drive commands [speed_mps, steering_rad], (n, 2), in the environment and return its steps."""
         experiment, track = self.experiment, self.track
-        plain = replace(
-            experiment,
-            observation=replace(experiment.observation, camera=None, lidar=None),
+        course = Course(name=track.name, weight=1.0, tracks=(track,))
+        # Alone on the road, and seen by no sensor: only the commands drive.
+        setup = replace(
+            build_setup(experiment, (course,), NO_REWARD),
+            actions=ContinuousActions(self.low, self.high),
+            observation=replace(experiment.observation, camera=None, lidar=None, next_objects=0),
             randomization=no_randomization(),
             episode=replace(experiment.episode, max_steps=0),
+            others=None,
         )
-        course = Course(name=track.name, weight=1.0, tracks=(track,))
-        actions = ContinuousActions(self.low, self.high)
-        race = Race(replace(build_setup(plain, (course,), NO_REWARD), actions=actions), 1)
+        race = Race(setup, 1)
         race.reset(None, None, np.zeros(1))
         wanted = np.column_stack([np.degrees(commands[:, 1]), commands[:, 0]])
         # The car stands while the prepare step is taken, and at the last step its command no longer counts.

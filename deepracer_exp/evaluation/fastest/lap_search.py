@@ -1,11 +1,11 @@
-"""The search for the fastest lap: planned a few seconds at a time, then improved as a whole.
+"""The search for the fastest lap: receding-horizon planning, then refinement of the whole lap.
 
-Commands are held for a control period and the road counts at the end of each, as in the environment. The search asks
-for the longest way in a given number of periods; where the car crosses the line with a period to spare, it continues
+As in the environment, a command is held for a control period, and the track limits count at its end. The search
+maximises the distance in a given number of periods; once the car crosses the line with a period to spare, it continues
 with one period less.
 
-Improving commands finds local optima only. Each few seconds are therefore planned from several first guesses, the plan
-that gets farthest is driven, and a lap is searched again with the line of the best one so far among the guesses.
+Refinement finds local optima only. So each window is planned from several initial guesses and the plan that gets
+farthest is driven; then the lap is searched again, with the line of the best one so far among the guesses.
 """
 
 import math

@@ -1,8 +1,8 @@
-"""Commands improved step by step until a car gets as far as it can in a number of control periods.
+"""Trajectory optimisation: the commands that take a car farthest in a number of control periods.
 
-The method is differential dynamic programming with limited commands (Tassa, Mansard and Todorov, "Control-Limited
-Differential Dynamic Programming", ICRA 2014) with first derivatives of the motion (iLQR). That a wheel stays on the
-road is an augmented Lagrangian (Howell, Jackson and Manchester, "ALTRO", IROS 2019).
+The method is iLQR with box constraints on the commands (Tassa, Mansard and Todorov, "Control-Limited Differential
+Dynamic Programming", ICRA 2014). An augmented Lagrangian keeps a wheel on the road (Howell, Jackson and Manchester,
+"ALTRO", IROS 2019).
 """
 
 import math
@@ -115,7 +115,7 @@ def _roll(cars, drives, states, commands, steps, dt_s):  # type: ignore[no-untyp
 
 @njit(cache=True)
 def _penalty(short_m, multiplier, stiffness):  # type: ignore[no-untyped-def]
-    """Return the augmented Lagrangian of clearance that is short by `short_m` and its derivatives by that."""
+    """Return the augmented Lagrangian of a clearance `short_m` too small, and its derivatives by `short_m`."""
     pull = multiplier + stiffness * short_m
     if pull <= 0.0:
         return -0.5 * multiplier * multiplier / stiffness, 0.0, 0.0
