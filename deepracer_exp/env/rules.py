@@ -243,14 +243,12 @@ class RaceRules:
     def put_back(self, ids: Ids, percent: np.ndarray) -> Pose:
         """Continue the cars' episodes from another place and return where their chassis origins are put.
 
-        The front of the car is put at that progress in per cent, (n,), but its chassis origin not behind the start.
+        As on the service the chassis origin is put where the front was at that progress in per cent, (n,).
         """
-        length_m = self.length_m[ids]
-        ahead_m = np.maximum(percent / 100.0 * length_m - self._front_point_m, 0.0)
         self._previous[ids] = percent
         self._last_progress[ids] = percent
         self._episode_rules.reset(ids)
-        return self.tracks.start_pose(self.start_ndist[ids] + ahead_m / length_m, self.track_index[ids])
+        return self.tracks.start_pose(self.start_ndist[ids] + percent / 100.0, self.track_index[ids])
 
     def start_midway(self, steps: np.ndarray, progress: np.ndarray) -> None:
         """Put all cars in the middle of their episodes, after `steps` control steps, at `progress` per cent, (N,)."""

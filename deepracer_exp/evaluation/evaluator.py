@@ -19,6 +19,7 @@ from deepracer_exp.env.race import Race
 from deepracer_exp.env.real_car import as_the_car, require_car
 from deepracer_exp.env.setup import Course, build_setup
 from deepracer_exp.env.trace_columns import PACKED, STATUS_CODE
+from deepracer_exp.errors import BadInput
 from deepracer_exp.rewards.source import NO_REWARD
 from deepracer_exp.runs.stored_run import StoredRun
 from deepracer_exp.tracks.track import directed_tracks
@@ -100,6 +101,12 @@ class Evaluator:
         rivals = rival_setup(setup, rival_sees or experiment.observation) if against_rival else None
         if config.real_car is not None:
             require_car(experiment)
+            if against_rival:
+                raise BadInput(
+                    "evaluation.real_car",
+                    "a rival is not driven as the physical car",
+                    "a race without rivals",
+                )
             setup = as_the_car(setup, config.real_car)
         of_trials = [conditions[trial.condition] for trial in self.trials]
         self.race = (

@@ -1,4 +1,4 @@
-"""A lap of an evaluation, recorded step by step, its poses between the steps, and the encoder of its film."""
+"""Films of evaluated laps: recording of the steps, interpolation of poses between them, and encoding."""
 
 import io
 from collections.abc import Container, Iterable
@@ -28,6 +28,8 @@ from .results import USUAL, Evaluation
 FRAMES_PER_S = 30.0
 _LINGER_S = 1.0
 """Seconds for which the last frame is shown."""
+_JUMP_M = 1.0
+"""Distance that no car drives in a step, but that a car put back may be away."""
 _COLUMNS = [PACKED[name] for name in ("X", "Y", "yaw", "steer", "speed_mps", "progress")]
 
 
@@ -80,7 +82,9 @@ def in_frames(lap: Lap, control_hz: float) -> tuple[Lap, NDArray[np.intp]]:
     step = time_steps.astype(np.intp)
     after = np.minimum(step + 1, len(lap) - 1)
     passed = time_steps - step
+    moved_m = np.hypot(lap.x_m[after] - lap.x_m[step], lap.y_m[after] - lap.y_m[step])
     put_back = (lap.time_s[after] - lap.time_s[step] > 1.5 / control_hz) | (held[after] & ~held[step])
+    put_back |= moved_m > _JUMP_M
     part = np.where(put_back, 0.0, passed)
 
     def between(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -87,8 +87,8 @@ def test_summit_puts_the_car_back_at_its_last_progress_standing(experiment, prot
     assert {lap.resets for lap in attempts if lap.end == "off_track"} == {3}
     assert max(lap.resets for lap in attempts) == 3
     for at in off[off + 1 < len(progress)]:
-        # Of a new lap, the chassis' origin is on the line and its front 0.14 m ahead.
-        expected = 100 * 0.14 / 9.4 if at in failed else progress[at - 1]
+        # The chassis' origin stands there, on the line with a new lap, and its front 0.14 m ahead.
+        expected = 100 * 0.14 / 9.4 + (0.0 if at in failed else progress[at - 1])
         assert progress[at + 1] == pytest.approx(expected, abs=0.5)
         assert abs(speed[at + 1]) < 1e-6
 

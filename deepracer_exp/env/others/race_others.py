@@ -165,7 +165,7 @@ class RaceOthers:
         rules.rest(np.flatnonzero(self.held))
         terminated, truncated = rules.ends(status)
         result = replace(result, running=running, status=status, terminated=terminated, truncated=truncated)
-        return result, has_hit & (status > STATUS_CODE["in_progress"])
+        return result, behind & (status > STATUS_CODE["in_progress"])
 
     def put_back(self, ids: Ids, pose: Pose, percent: Floats, crashed: Bools, hold_s: Floats) -> Pose:
         """Return the poses at which cars continue in the middle of their episodes, and hold them there.
