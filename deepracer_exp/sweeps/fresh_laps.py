@@ -1,4 +1,4 @@
-"""Fresh laps of a study: policies race from starts and with draws that no evaluation of the sweep had."""
+"""Fresh laps of a study: its best policies race from starts and with random draws unseen in the sweep."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -13,7 +13,7 @@ from optuna.trial import FrozenTrial
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.evaluation.results import HELD_OUT, USUAL, Evaluation, TrialGroup
 from deepracer_exp.runs.stored_run import StoredRun
-from deepracer_exp.sweeps.report.best_trial import FreshLaps, complete_trials
+from deepracer_exp.sweeps.report.best_trial import FreshLaps, complete_trials, has_runs
 
 from .queue.worker_config import WorkerConfig
 from .search.objectives import cost, objective_values, without_lap
@@ -47,13 +47,15 @@ def rerank(
 ) -> list[FreshLaps]:
     """Race the best checkpoints of the best trials on fresh laps; return their results, the best first.
 
-    The interval is a bootstrap over laps: of these policies, not of further trainings. `on_next` is called with each
-    trial before its laps, `on_step` after each control step; what they raise ends it.
+    The interval is a bootstrap over laps: of these policies, not of further trainings. A trial whose runs were deleted
+    is left out. `on_next` is called with each trial before its laps, `on_step` after each control step; what they raise
+    ends it.
     """
     config = worker_config.config
     protocol = fresh(worker_config.protocol, config.rerank_laps)
     fresh_laps = []
-    for trial in complete_trials(study)[: config.rerank]:
+    there = [trial for trial in complete_trials(study) if has_runs(trial, worker_config.folder)]
+    for trial in there[: config.rerank]:
         on_next(trial)
         runs = Trial.of(trial).runs
         driven = [drive_fresh(run.folder(worker_config.folder), protocol, on_step)[0] for run in runs]
@@ -70,30 +72,33 @@ def interval_of(evaluations: Sequence[Evaluation], objective: str, trial_time_s:
     rng = np.random.default_rng(0)
     counted = [
         [
-            group
-            for group in evaluation.groups
-            if group.track == track and (objective == "race_score" or group.condition == USUAL)
+            [
+                group
+                for group in evaluation.groups
+                if group.track == track and (objective == "race_score" or group.condition == USUAL)
+            ]
+            for track in evaluation.tracks
         ]
         for evaluation in evaluations
-        for track in evaluation.tracks
     ]
-    draws = np.mean([_draws(groups, objective, trial_time_s, rng) for groups in counted], axis=0)
+    draws = np.mean([_draws(by_track, objective, trial_time_s, rng) for by_track in counted], axis=0)
     tail = 100 * (1 - _CONFIDENCE) / 2
     return np.percentile(draws, [tail, 100 - tail]).tolist()
 
 
 def _draws(
-    groups: Sequence[TrialGroup], objective: str, trial_time_s: float, rng: np.random.Generator
+    by_track: Sequence[Sequence[TrialGroup]], objective: str, trial_time_s: float, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Return the objective's value on one track in each resample, (n,)."""
+    """Return the objective's value in each resample, (n,), the mean over tracks; times need a lap on each."""
     if objective == "zigzag":
-        return _zigzag_draws(groups, rng)
-    tried, laps, time_s, progress = np.sum([_resampled(group, objective, rng) for group in groups], axis=0)
-    completion = progress / tried
+        return np.mean([_zigzag_draws(groups, rng) for groups in by_track], axis=0)
+    drawn = [np.sum([_resampled(group, objective, rng) for group in groups], axis=0) for groups in by_track]
+    tried, laps, time_s, progress = np.stack(drawn, axis=1)
+    completion = np.mean(progress / tried, axis=0)
     if objective == "completion":
         return completion
     fallback = np.array([without_lap(share, trial_time_s) for share in completion])
-    return np.where(laps > 0, time_s / np.maximum(laps, 1), fallback)
+    return np.where((laps > 0).all(axis=0), np.mean(time_s / np.maximum(laps, 1), axis=0), fallback)
 
 
 def _zigzag_draws(groups: Sequence[TrialGroup], rng: np.random.Generator) -> NDArray[np.float64]:

@@ -22,7 +22,13 @@ from deepracer_exp.runs.checkpoint_files import checkpoint_words
 from deepracer_exp.runs.run_files import is_run
 from deepracer_exp.runs.run_result import FAILED, INTERRUPTED
 from deepracer_exp.runs.stored_run import StoredRun
-from deepracer_exp.sweeps.report.best_trial import best_trial, complete_trials, reranked, run_of
+from deepracer_exp.sweeps.report.best_trial import (
+    best_trial,
+    complete_trials,
+    has_runs,
+    reranked,
+    run_of,
+)
 from deepracer_exp.tracking.metadata import STUDY
 from deepracer_exp.training.budget import RunEnded
 from deepracer_exp.training.clone import plan_clone
@@ -147,8 +153,12 @@ class LastStage:
 
     def _raced(self, best: FrozenTrial, clone: Path) -> LastRace:
         order = [laps.trial for laps in reranked(self._study)]
-        trials = {trial.number: trial for trial in complete_trials(self._study)}
-        seconds = [number for number in (*order, *trials) if number != best.number][:1]
+        trials = {
+            trial.number: trial
+            for trial in complete_trials(self._study)
+            if has_runs(trial, self._config.folder)
+        }
+        seconds = [number for number in (*order, *trials) if number in trials and number != best.number][:1]
         runs = {number: run_of(self._study, trials[number], self._config.runs_dir) for number in seconds}
         racers = (
             self._racer(best.number, run_of(self._study, best, self._config.runs_dir)),

@@ -64,6 +64,8 @@ _log = logging.getLogger("deepracer_exp")
 
 _DONE_S, _INTERRUPTED_S = 30.0, 2.0
 """Seconds to wait for MLflow at the end of a sweep, and after an interruption."""
+_SAME_AS_TRIALS = ("track", "car", "race")
+"""Groups that a clone has from its trial: their laps would not compare."""
 
 
 def sweep(plan: SweepPlan, console: Console) -> tuple[Study, Path, int]:
@@ -147,6 +149,11 @@ def check_clone(trial: TrainPlan, config: SweepConfig, stored: bool) -> None:
         mapping = copy.deepcopy(trial.composition.mapping)
         changed = with_overrides(mapping, {}, config.clone_overrides, stored=stored)
         clone = parse_experiment(changed.mapping)
+        for name in _SAME_AS_TRIALS:
+            if getattr(clone, name) != getattr(trial.experiment, name):
+                raise BadInput(
+                    name, "another one than that of the trials, which the clone is raced against", "theirs"
+                )
         plan_training(clone, changed)
         refuse_other_networks(trial.experiment, clone)
     except BadInput as error:

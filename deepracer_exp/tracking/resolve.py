@@ -44,7 +44,10 @@ def resolve(run: str, runs_dir: Path, tracking_uri: str | None) -> StoredRun:
     if run.startswith(BEST):
         return StoredRun(best_of(run.removeprefix(BEST), runs_dir))
     with reading(run, RUN):
-        for folder in (Path(run).expanduser(), runs_dir / run):
+        path = Path(run).expanduser()
+        if len(path.parts) < 2 or ".." in path.parts:
+            path = path.resolve()  # the folders above it are its experiment and runs_dir
+        for folder in (path, runs_dir / run):
             if is_run(folder):
                 return StoredRun(folder)
     if is_run_id(run):

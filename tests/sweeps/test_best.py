@@ -1,5 +1,6 @@
 import json
 import shlex
+import shutil
 from pathlib import Path
 
 import pytest
@@ -91,6 +92,16 @@ def with_runs(study, values):
         write_metrics(run_dir, 2)
         runs.append(SeedRun(seed=seed, run_dir=str(run_dir), status="finished", values=value))
     add(study, [sum(value[0] for value in values) / len(values)], runs=tuple(runs))
+
+
+def test_with_several_seeds_the_command_trains_with_that_of_the_best_run(tmp_path):
+    study = new_study(tmp_path / "runs", seeds=3)
+    with_runs(study, ([10.0], [9.0], [9.5]))
+    best = best_run(study)
+    (best / "config.yaml").write_text("seed: 41\n")
+    assert shlex.split(best_line(study))[-1] == "seed=41"
+    shutil.rmtree(best)
+    assert not any(word.startswith("seed=") for word in shlex.split(best_line(study)))
 
 
 def test_the_best_run_is_that_of_the_best_seed_wherever_all_runs_have_moved(tmp_path):

@@ -119,6 +119,16 @@ def test_a_release_frees_the_trials_of_that_owner_only(claims):
     assert claims.claim("other", 2, HOUR_S) is None
 
 
+def test_attempts_stay_counted_where_a_worker_was_lost_and_not_where_it_was_to_end(claims):
+    for is_lost, tries in ((True, 2), (False, 0), (True, 0)):
+        claim = claims.claim("gone", 1, HOUR_S)
+        if is_lost and tries:
+            claims.record(claim, [SeedRun(seed=0, tries=2)])
+        assert claims.release("gone", is_lost=is_lost) == 1
+        (found,) = claims.all()
+        assert [run.tries for run in found.trial.runs] == [tries]
+
+
 def test_a_result_waits_until_it_is_reported_to_optuna(claims):
     claim = claims.claim("one", 2, HOUR_S)
     claims.settle(claim, result(values=[1.0, 2.0], reason="x" * 70_000))

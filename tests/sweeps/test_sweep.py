@@ -5,6 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from types import SimpleNamespace
 
+import optuna
 import pytest
 from mlflow import MlflowClient
 
@@ -14,12 +15,13 @@ from deepracer_exp.errors import RunFailed
 from deepracer_exp.evaluation.race_protocol import Attempt
 from deepracer_exp.evaluation.results import HELD_OUT, USUAL, Evaluation, TrialGroup
 from deepracer_exp.runs.run_files import read_object
-from deepracer_exp.sweeps.fresh_laps import interval_of
+from deepracer_exp.sweeps.fresh_laps import interval_of, rerank
 from deepracer_exp.sweeps.queue.claims import Claim
 from deepracer_exp.sweeps.queue.driver import Driver
 from deepracer_exp.sweeps.queue.storage import open_storage
 from deepracer_exp.sweeps.queue.worker_config import Parent
 from deepracer_exp.sweeps.run_sweep import _conclude, _parent, _without_rules, begin_study_run
+from deepracer_exp.sweeps.search.objectives import objective_values
 from deepracer_exp.sweeps.search.space import SearchSpace
 from deepracer_exp.sweeps.trial import Interrupted, SeedRun, Trial
 from deepracer_exp.tracking import study_run
@@ -107,7 +109,7 @@ def test_drivers_that_begin_at_once_share_one_run_in_mlflow(monkeypatch, tmp_pat
 
 def test_ctrl_c_ends_the_re_ranking_between_two_trials(tmp_path):
     study = new_study(tmp_path)
-    add(study, [9.0])
+    add(study, [9.0], metrics=1)
     config = SimpleNamespace(rerank=1, rerank_laps=60, clone=None, objectives=("race_score",))
     protocol = compose_evaluation(["evaluation=sweep"])[0].evaluation
     worker_config = SimpleNamespace(config=config, protocol=protocol, folder=tmp_path, runs_dir=tmp_path)
@@ -136,6 +138,37 @@ def test_the_interval_of_a_race_score_holds_the_score_of_all_conditions():
     assert 7.0 < low < 8.0 < high < 9.0
     assert interval_of([evaluation], "lap_time", 120.0) == pytest.approx([6.0, 6.0])
     assert interval_of([evaluation], "completion", 120.0) == pytest.approx([100.0, 100.0])
+
+
+def test_a_lap_time_needs_a_lap_on_every_track():
+    def on(track: str, progress: float, time_s: float, first: int) -> TrialGroup:
+        trials = range(first, first + 10)
+        return TrialGroup(track, USUAL, tuple(trials), tuple(_lap(k, time_s, progress) for k in trials))
+
+    both = Evaluation((on("short", 100.0, 8.0, 0), on("long", 100.0, 20.0, 10)))
+    one = Evaluation((on("short", 100.0, 8.0, 0), on("long", 60.0, 12.0, 10)))
+    for evaluation, lap_s in ((both, 14.0), (one, 120.0 * 1.2)):
+        assert objective_values(evaluation, ["lap_time"], 120.0) == pytest.approx([lap_s])
+        for objective in ("lap_time", "race_score"):
+            assert interval_of([evaluation], objective, 120.0) == pytest.approx([lap_s, lap_s])
+    assert interval_of([one], "completion", 120.0) == pytest.approx([80.0, 80.0])
+
+
+def test_a_trial_whose_run_was_deleted_is_not_driven_again(tmp_path):
+    study = new_study(tmp_path)
+    add(study, [9.0])
+    add(study, [10.0], metrics=1)
+    config = SimpleNamespace(rerank=2, rerank_laps=60)
+    protocol = compose_evaluation(["evaluation=sweep"])[0].evaluation
+    driven: list[int] = []
+
+    def on_next(trial: optuna.trial.FrozenTrial) -> None:
+        driven.append(trial.number)
+        raise Interrupted
+
+    with pytest.raises(Interrupted):
+        rerank(SimpleNamespace(config=config, protocol=protocol, folder=tmp_path), study, on_next, print)
+    assert driven == [1]
 
 
 def test_the_same_error_of_several_runs_is_counted_as_one(tmp_path):

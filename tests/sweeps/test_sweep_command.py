@@ -44,6 +44,7 @@ def load(cwd, name):
         ),
         ((LR, "sweep.clone={network: mlp}"), ("sweep.clone: network: cannot be changed in a clone",)),
         ((LR, "sweep.clone={name: other}"), ("sweep: clone: name",)),
+        ((LR, "sweep.clone={track: Monaco}"), ("sweep.clone: track: another one", "accepted: theirs")),
         ((LR, "parent=no_such_run"), ("parent=no_such_run",)),
         ((LR, "--storage", "sqlite:///x.db"), ("unrecognized arguments: --storage",)),
         ((LR, "sweep.storage=sqlite:////proc/x.db"), ("sweep.storage=", "/proc/x.db cannot be written")),

@@ -36,6 +36,12 @@ def shown(claims, is_terminal=True, first=(), after_s=0.0):
     return text.getvalue()
 
 
+def test_a_trial_of_an_algorithm_without_entropy_is_shown():
+    one = claim(0)
+    one.progress["entropy"] = None
+    assert "8,192" in shown([one])
+
+
 ENDED = [
     claim(
         0,

@@ -39,16 +39,16 @@ def storage(url, tmp_path):
 def started(url, storage, tmp_path):
     """Return a function that begins or continues the study as its driver does, and returns it with a worker."""
 
-    def start(*asked):
+    def start(*asked, runs_dir=tmp_path):
         overrides = [*asked, "tracking=off", "study=s", f"sweep.storage={url}", "sweep.startup_trials=2"]
-        request = compose_sweep([*overrides, f"runs_dir={tmp_path}"])
+        request = compose_sweep([*overrides, f"runs_dir={runs_dir}"])
         space = SearchSpace.from_request(request)
         known = known_settings(request, space)
         complete_widening("s", storage)
-        study = open_study(request, overrides, space, None, storage, tmp_path)
+        study = open_study(request, overrides, space, None, storage, runs_dir)
         enqueue(study, known)
         config = WorkerConfig(
-            study="s", runs_dir=tmp_path, config=request.entry.sweep,
+            study="s", runs_dir=runs_dir, config=request.entry.sweep,
             protocol=compose_evaluation(["evaluation=sweep"])[0].evaluation,
             space=space, parent=None, store=None, study_run_id=None, evaluations=None, cores=1,
         )  # fmt: skip
@@ -65,6 +65,16 @@ def made(started):
         return study.get_trials()
 
     return make
+
+
+@in_a_file
+def test_a_study_goes_on_with_its_overrides_in_any_order_and_its_runs_elsewhere(started, tmp_path):
+    study, _ = started(LR, "seed=3", "budget.iterations=2")
+    again, _ = started("budget.iterations=2", LR, "seed=3")
+    assert again.user_attrs["runs_dir"] == study.user_attrs["runs_dir"] == str(tmp_path)
+    moved, _ = started(LR, "budget.iterations=2", "seed=3", runs_dir=tmp_path / "moved")
+    assert moved.user_attrs["runs_dir"] == str(tmp_path / "moved")
+    assert "every trial: seed=3 -> seed=4" in refused(started, LR, "budget.iterations=2", "seed=4")
 
 
 def test_a_search_with_another_choice_and_a_wider_interval_keeps_the_trials(made):

@@ -59,6 +59,16 @@ def test_runs_whose_ranks_mean_different_things_are_refused_by_name(season, conf
     assert words in refusal("best:season", season)
 
 
+@pytest.mark.parametrize("below", [".", "checkpoints"])
+def test_a_run_named_from_its_own_folders_lies_in_its_experiment(season, monkeypatch, below):
+    run = season.run("1")
+    (run / below).mkdir(exist_ok=True)
+    for place, name in ((run.parent, "1"), (run / below, "." if below == "." else "..")):
+        monkeypatch.chdir(place)
+        found = resolve(name, season.runs_dir, None).path
+        assert found.parent.parent.resolve() == season.runs_dir.resolve()
+
+
 def test_runs_trained_on_different_tracks_compare_when_evaluated_on_the_same(season):
     evaluation = {"trials": 8, "tracks": ["oval"]}
     season.result(season.run("1", evaluation=evaluation), (1, -10.0))

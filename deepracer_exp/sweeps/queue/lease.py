@@ -1,4 +1,4 @@
-"""Leases of trials, which the worker of each renews itself: one that hangs or is suspended loses its trial."""
+"""Leases of trials: each worker renews its own, so that a worker that hangs or is suspended loses its trial."""
 
 import logging
 import threading

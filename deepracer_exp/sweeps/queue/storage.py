@@ -1,4 +1,4 @@
-"""The database of studies: its address checked, opened safely by many processes at once, and waited for."""
+"""The database of studies: checks its address, opens it safely from many processes, and waits out its absence."""
 
 import atexit
 import logging
@@ -38,8 +38,8 @@ DOWN = (OperationalError, InterfaceError, InternalError, PoolTimeout, StorageInt
 _BUSY = ("SQLITE_BUSY", "SQLITE_LOCKED", "SQLITE_PROTOCOL")
 _SAY_AFTER_S = 5.0
 _PAUSES = wait_exponential_jitter(multiplier=0.1, max=10.0, jitter=0.1)
-"""Between calls of a database that does not answer: longer and longer, with jitter, so that processes that began to
-wait together do not return together."""
+"""Pauses between retries while the database does not answer: exponential backoff, with jitter so that processes do not
+retry in step."""
 
 _KINDS = ("sqlite", "postgresql")
 _ACCEPTED = "accepted: sqlite:////path/sweeps.db, postgresql+psycopg://user@host/name"

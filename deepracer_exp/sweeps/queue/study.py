@@ -177,6 +177,8 @@ def open_study(
             )
     for key in _OF_LAST_START:
         study.set_user_attr(key, getattr(sweep, key))
+    for key in ("base", "runs_dir"):  # the runs may have moved
+        study.set_user_attr(key, wanted[key])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ExperimentalWarning)
         # Optuna Dashboard calls them "Objective 0" otherwise.
@@ -190,12 +192,16 @@ def _differences(stored: dict[str, object], wanted: dict[str, object], searched:
 
     lines = [f"{key}: {stored.get(key)} -> {wanted[key]}" for key in _SAME if stored.get(key) != wanted[key]]
     before, now = (
-        [line for line in base if not _chooses_processes(line) and key_of(line) not in searched]
+        [
+            line
+            for line in base
+            if not _chooses_processes(line) and key_of(line) not in {*searched, "runs_dir"}
+        ]
         if isinstance(base, list)
         else []
         for base in (stored.get("base"), wanted["base"])
     )
-    if before != now:
+    if {*before} != {*now}:  # in any order: the last of a key counts
         gone, new = [line for line in before if line not in now], [line for line in now if line not in before]
         lines.append(f"every trial: {' '.join(gone) or 'nothing'} -> {' '.join(new) or 'nothing'}")
     return lines

@@ -1,4 +1,4 @@
-"""The runs of a trial, one per seed: made, or resumed where an earlier worker left them."""
+"""Makes the runs of a trial, one per seed, or resumes them where an earlier worker stopped."""
 
 import time
 import traceback
@@ -58,7 +58,7 @@ _KEEPS = {"report": "false", "trace": "laps"}
 Traces are two thirds of a study's disk; laps save an eighth of them where most steps are of laps, as on short tracks.
 """
 _MOST_TRIES = 3
-"""Most starts of a run at the same checkpoint if its process is lost each time."""
+"""Most attempts at a run from the same checkpoint, if its process is lost each time."""
 _STATES = {FAILED: "FAIL", STOPPED_EARLY: "PRUNED"}
 """Optuna's state of a trial whose last run has this status; other runs are complete."""
 _SHOWN = ("iteration", "env_steps", "completion", "entropy", "eval_completion", "eval_lap_time_s")
@@ -155,7 +155,7 @@ class TrialRun(Callback):
         """Report an evaluation to Optuna, and return the pruners' decision."""
         if len(self._config.config.objectives) > 1:
             return None  # Optuna compares trials by one number only.
-        rows = _rows(Path(self._runs[0].run_dir or ""))
+        rows = _rows(self._runs[0].folder(self._config.folder))
         step = 1 + sum(row["eval_completion"] is not None for row in rows)
         if not self._reported:
             self._reported |= self._storage.get_trial(self._trial_id).intermediate_values.keys()
@@ -281,7 +281,7 @@ class TrialRun(Callback):
 
     def _count_attempt(self, run: SeedRun) -> SeedRun | None:
         """Count another attempt at a run; return it as failed if its process was lost each time so far."""
-        run_dir = Path(run.run_dir or "")
+        run_dir = run.folder(self._config.folder)
         checkpoints = kept_checkpoints(run_dir / CHECKPOINTS)
         iteration = max((int(path.name) for path in checkpoints if path.name.isdecimal()), default=0)
         lost = run.tries if run.tried_at == iteration else 0

@@ -1,7 +1,7 @@
-"""Widen a study's search: its trials are kept, with their values in the wider space.
+"""Widens the search space of a study and keeps its trials.
 
-In one study of Optuna the choices of a key cannot change. So the study is written again, first under another name, then
-under its own. The next start of the sweep completes the work of a killed process.
+Optuna does not let the choices of a key change within a study. So the study is rewritten, first under another name,
+then under its own. If the process is killed in between, the next start of the sweep completes the work.
 """
 
 import copy

@@ -1,5 +1,6 @@
 """The best trial of a study: its values, the command that trains it, its run, and its lead over seeds."""
 
+import contextlib
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ from optuna.trial import FrozenTrial, TrialState
 from deepracer_exp.errors import BadInput
 from deepracer_exp.reports.tables.evidence import Values, difference, estimate
 from deepracer_exp.runs.best_run import BestOfSweep, write_best_of_sweep
-from deepracer_exp.runs.run_files import is_run
+from deepracer_exp.runs.run_files import is_run, read_config
 from deepracer_exp.runs.run_result import FRESH_LAPS, SWEEP_LAPS
 from deepracer_exp.sweeps.search.objectives import (
     MEASURES,
@@ -94,6 +95,10 @@ def best_line(study: optuna.Study) -> str:
     """Return the command that repeats the winner's training, quoted for a shell."""
     attrs = best_trial(study).user_attrs
     overrides = [str(override) for key in ("overrides", "where") for override in attrs.get(key, ())]
+    if study.user_attrs.get("seeds", 1) > 1:  # the trial's overrides are those of the first
+        with contextlib.suppress(BadInput):
+            seed = read_config(best_run(study))["seed"]
+            overrides = [*(line for line in overrides if not line.startswith("seed=")), f"seed={seed}"]
     if parent := study.user_attrs.get("parent_run"):
         clone = ["deepracer-exp", "clone", parent["run_dir"], f"checkpoint={parent['checkpoint']}"]
         return shlex.join([*clone, *overrides])
@@ -107,6 +112,11 @@ def best_run(study: optuna.Study, runs_dir: Path | None = None) -> Path:
         BadInput: no trial is complete, or the folder is neither where it was nor in `runs_dir`.
     """
     return run_of(study, best_trial(study), runs_dir)
+
+
+def has_runs(trial: FrozenTrial, folder: Path) -> bool:
+    """Return whether the runs of a trial, in the study's `folder`, are still there."""
+    return all(is_run(run.folder(folder)) for run in Trial.of(trial).runs)
 
 
 def run_of(study: optuna.Study, trial: FrozenTrial, runs_dir: Path | None = None) -> Path:

@@ -142,7 +142,7 @@ class SweepView:
             f"{row['env_steps']:,}",
             NONE if row["completion"] is None else f"{row['completion']:.0f}%",
             sparkline(list(self._completions.get(number, ())), _POINTS),
-            f"{row['entropy']:.2f}",
+            NONE if row["entropy"] is None else f"{row['entropy']:.2f}",
             self._evaluated.get(number, NONE),
         )
 

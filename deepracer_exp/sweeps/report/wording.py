@@ -21,6 +21,7 @@ ENDINGS: Mapping[str, EndingStyle] = {
     "reliable": EndingStyle("#56B4E9", "completed enough laps"),
     "plateau": EndingStyle("#A0C0E0", "stopped improving"),
     "overfitting": EndingStyle("#E0C0A0", "lost held-out conditions while its return held"),
+    "laps_slower": EndingStyle("#999933", "its laps became slower while its return held"),
     "collapsed": EndingStyle("#D55E00", "entropy fell before it could drive"),
     "not_learning": EndingStyle("#E69F00", "entropy and completion stayed where they began"),
     "other_rule": EndingStyle("#663300", "ended by another stopping rule"),
@@ -52,7 +53,7 @@ def ending_words(ending: str) -> str:
 
 
 def short_keys(keys: Iterable[str]) -> dict[str, str]:
-    """Return the shortest distinct ending of each dotted key: its last part, or several."""
+    """Return the shortest unique suffix of each dotted key: its last part, or several."""
     parts = {key: key.split(".") for key in keys}
     short: dict[str, str] = {}
     for key, words in parts.items():

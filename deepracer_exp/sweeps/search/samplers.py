@@ -57,9 +57,9 @@ def build_sampler(config: SweepConfig, space: SearchSpace) -> BaseSampler:
 class _PerTrialSampler(BaseSampler):
     """A fresh sampler for each trial, seeded by the trial's number.
 
-    A sampler draws from its seed on. Workers share the study's seed, so each of them, and each start of a study, would
-    try the same first points again. Here the draws of a trial depend on its number and not on the worker or the moment;
-    the results of earlier trials are in the study.
+    Workers share the study's seed, so with a single sampler per process each worker, and each start of a study, would
+    try the same first points. Here the draws of a trial depend on its number, not on the worker or the moment; the
+    results of earlier trials are in the study.
     """
 
     def __init__(self, make: Callable[[int], BaseSampler]):
