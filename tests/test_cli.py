@@ -151,13 +151,19 @@ def test_a_grid_of_single_runs_has_no_groups(train_here):
     assert "Groups" not in ended.stdout
 
 
-def test_tracks_lists_each_family_once_with_its_variants(call):
-    lines = [line.split() for line in call("tracks").stdout.splitlines()]
+def test_tracks_lists_each_family_once_with_its_variants(call, tmp_path):
+    own = tmp_path / "conf" / "track"
+    own.mkdir(parents=True)
+    (own / "broken.yaml").write_text("defaults: [reinvent_base, _self_]\nname: broken\nfile: gone.npy\n")
+    text = call("tracks").stdout
+    assert "\nbroken: track.file: gone.npy: cannot be read" in text
+    lines = [line.split() for line in text.splitlines()]
     named = {line[0]: line for line in lines if line}
     assert set(leaders()) <= named.keys()
     assert not (worlds().keys() - set(leaders())) & named.keys()
     assert named["2022_april_open"][-5:] == ["50.30", "1.07", "169", "…_ccw", "…_cw"]
     assert named["reinvent_base"][-1] == "reinvent_wood"
+    assert named["broken"] == ["broken", "unusable"]
 
 
 def test_tracks_draws_one_and_writes_nothing_unasked(call, tmp_path):

@@ -181,12 +181,13 @@ def _complete(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[st
 
 
 def _source(what: str, overrides: list[str], track: str | None) -> _Source:
+    from deepracer_exp.aws.worlds.catalogue import find_world
     from deepracer_exp.config.options import options
     from deepracer_exp.runs.run_files import is_run
 
     place = existing_logs(what)
     is_route = place is not None and place.suffix in ROUTES
-    if is_route or (place is None and what in options("track")):
+    if is_route or (place is None and (what in options("track") or find_world(what) is not None)):
         return _of_track(what, is_route, overrides, track)
     stores = read_stores(overrides, ["checkpoint"])
     if place is None or is_run(place):

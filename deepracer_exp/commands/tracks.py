@@ -123,12 +123,20 @@ def _list_tracks() -> None:
             str(world.rows),
             " ".join(other.name.replace(other.family, "…", 1) for other in others),
         )
+    unusable = []
     for name in options("track"):
         if name not in worlds():
-            _, track = experiment_on([override_line("track", name)])
+            try:
+                _, track = experiment_on([override_line("track", name)])
+            except BadInput as error:
+                table.add_row(name, "unusable", "", "", "", "")
+                unusable.append(f"{name}: {error}")
+                continue
             measures = f"{track.length_m:.2f}", f"{track.width_m:.2f}", str(len(track.waypoints))
             table.add_row(name, track.title, *measures, "")
     out.print(table)
+    for line in unusable:
+        out.print(f"\n{line}", soft_wrap=True, markup=False)
     out.print(
         f"\ntrack=NAME accepts each of {len(options('track'))} tracks, also variants and official names "
         "(track='Ace Speedway').\n`deepracer-exp tracks NAME` draws one.",

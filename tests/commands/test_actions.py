@@ -74,7 +74,7 @@ def test_the_fastest_lap_of_a_track_has_actions(call, tmp_path, monkeypatch):
     steps[1:, COLUMNS.index("commanded_mps")] = np.repeat([4.0, 3.0, 2.0], 30)
     lap = FastestLap(lap_time_s=6.0, bound_s=5.9, steps=steps)
     _keep(Question.of(experiment, course), lap)
-    ended = call("actions", "Oval_track", "--name", "mine", "car=deepracer_v5")
+    ended = call("actions", "oval track", "--name", "mine", "car=deepracer_v5")
     assert ended.code == 0, ended.stderr
     assert "Oval_track: the fastest lap of deepracer_v5 on Oval_track, 6.00 s" in ended.stdout
     metadata = json.loads((tmp_path / "mine" / "model_metadata.json").read_text())

@@ -202,6 +202,9 @@ def test_a_model_of_several_tracks_is_a_run_on_the_first_unless_others_are_given
 def test_an_archive_holds_what_the_folder_does(tmp_path, pack):
     tensors = {"a/kernel": np.arange(6, dtype=np.float32).reshape(2, 3), "b/bias": np.ones(4, np.float32)}
     files = {f"prefix/{name}": content for name, content in files_of(tensors).items()}
+    # What a Mac adds to its archives.
+    files |= {f"__MACOSX/prefix/{name}": b"Mac OS X" for name in (INDEX, DATA)}
+    files |= {f"prefix/{name.replace('model/', 'model/._')}": b"Mac OS X" for name in (INDEX, DATA)}
     if pack is None:
         path = write_folder(tmp_path / "model", files)
     else:

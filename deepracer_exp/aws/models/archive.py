@@ -85,6 +85,8 @@ class _Files:
         parts = PurePosixPath(name.replace("\\", "/"))
         if parts.is_absolute() or ".." in parts.parts or re.match(r"[A-Za-z]:", name):
             raise BadInput(self.path, f"{name}: leads out of the archive", _ACCEPTED)
+        if parts.parts[:1] == ("__MACOSX",) or parts.name.startswith("._"):
+            return  # what a Mac adds to its archives
         self._total += size
         if len(self.sizes) >= _MOST_FILES or self._total > self._most_bytes:
             raise BadInput(

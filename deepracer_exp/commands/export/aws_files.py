@@ -110,7 +110,7 @@ def _hyperparameters(experiment: Experiment) -> tuple[Hyperparameters, list[str]
         low, high = CONSOLE_RANGES[key]
         nearest = min(max(value, low), high)
         if key == "batch_size":
-            nearest = 1 << (nearest.bit_length() - 1)  # a power of two
+            nearest = min((1 << power for power in range(5, 10)), key=lambda size: abs(size - value))
         learning = replace(learning, **{key: nearest})
         notes.append(
             f"hyperparameters.json: {key}={nearest}, the nearest to {value:g} that the AWS console accepts"

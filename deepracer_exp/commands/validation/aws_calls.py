@@ -1,6 +1,6 @@
 """The process in which a reward function is called as deepracer-on-aws' validator calls it; see `aws_dry_run`.
 
-It imports little itself, because a call's import of a loaded module is invisible.
+It imports little itself, because a call's import goes unnoticed if the module is already loaded.
 """
 
 import inspect

@@ -25,7 +25,7 @@ _MARGIN = 0.01
 _LAP_MARGIN = 0.02
 """Margin for returns of laps, whose lines are not quite the same."""
 _ASKS = 0.2
-"""Growth of the return, relative, per relative saving of time below which speed counts little; a race score has 1."""
+"""Elasticity of the return to time saved, below which speed counts little; that of a race score is 1."""
 
 
 def constant_reward(rewards: np.ndarray) -> Iterator[str]:
@@ -142,7 +142,7 @@ def slow_laps_return_as_much(laps: Sequence[LapReturn], discount: float) -> Iter
         return
 
     def gain(slow: LapReturn) -> float:
-        """Return the relative growth of the return per relative saving of time."""
+        """Return the elasticity of the return to time saved: its relative growth per relative saving."""
         scale = max(abs(slow.total), abs(fast.total), 1e-9)
         return (fast.total - slow.total) / scale / (1 - fast.time_s / slow.time_s)
 

@@ -1,4 +1,4 @@
-"""Laps driven in the simulated car by a simple driver: of one line at several shares of its speeds, and flawed ones."""
+"""Laps of a scripted driver in the simulated car: one line at several speeds, and laps with a flaw."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -86,8 +86,8 @@ def action_space_laps(setup: RaceSetup) -> list[DrivenLap]:
 def flawed_laps(setup: RaceSetup, good: DrivenLap) -> dict[str, DrivenLap]:
     """Return laps like a good one but no faster, each with a flaw by which it is named.
 
-    The flaw is as strong as the car stays on the road with all wheels; where it does not stay there with the least of
-    it, the lap is missing.
+    Each flaw is as strong as it can be with all wheels on the road; a lap that leaves the road even with the weakest
+    flaw is missing.
     """
 
     def laps(bends: Sequence[float], **flaw: float) -> list[SimpleDriver]:
@@ -122,7 +122,9 @@ def drive_laps(setup: RaceSetup, drivers: Sequence[SimpleDriver]) -> list[Driven
     n = len(drivers)
     share = np.array([driver.share for driver in drivers])
     car = setup.car
-    lowest_mps, highest_mps = float(setup.actions.low[1]), float(setup.actions.high[1])
+    # The car drives no slower than that.
+    lowest_mps = max(float(setup.actions.low[1]), car.min_speed_mps)
+    highest_mps = max(float(setup.actions.high[1]), lowest_mps)
     batch = CarBatch(car, n, 1, setup.track.floor.friction)
     rules = RaceRules(setup, n)
     pose = rules.reset(start_ndist=np.zeros(n))

@@ -158,8 +158,8 @@ class NamedSituation:
 
 
 def middle_speed_mps(setup: RaceSetup) -> float:
-    """Return the mean of the slowest and the fastest speed of the action space."""
-    return float(setup.actions.low[1] + setup.actions.high[1]) / 2
+    """Return the mean of the slowest and the fastest speed of the action space, at least the car's slowest."""
+    return max(float(setup.actions.low[1] + setup.actions.high[1]) / 2, setup.car.min_speed_mps)
 
 
 def start(setup: RaceSetup) -> Situations:

@@ -93,9 +93,10 @@ def validate_reward(
         look_closer(check)
     if not check.failures:
         _print_laps(out, check)
-        _draw(out, check, _default_picture(plan.experiment, check) if output is None else Path(output))
     _print_lines(out, "Warnings", "yellow", check.warnings)
     _print_lines(out, "Failures", "red", check.failures)
+    if not check.failures:
+        _draw(out, check, _default_picture(plan.experiment, check) if output is None else Path(output))
     if trial is not None and not check.failures and not (strict and check.aws):
         for line in train_shortly(err, trial):
             _line(out, line)

@@ -92,7 +92,7 @@ def test_exported_sensors_name_the_overrides_that_have_them(tmp_path, overrides)
     ("override", "key", "value"),
     [
         ("algorithm.batch_size=1024", "batch_size", 512),
-        ("algorithm.batch_size=100", "batch_size", 64),
+        ("algorithm.batch_size=100", "batch_size", 128),
         ("algorithm.batch_size=16", "batch_size", 32),
         ("algorithm.lr=0.01", "lr", 0.001),
         ("algorithm.epochs=20", "num_epochs", 10),

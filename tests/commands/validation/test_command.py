@@ -33,6 +33,12 @@ def test_a_good_reward_ends_with_a_verdict_and_a_picture(call, tmp_path):
     assert imread(picture).shape[1] > 400
 
 
+def test_an_action_that_stops_the_car_is_driven_at_its_slowest_speed(call):
+    speeds = ("action_space=continuous", "action_space.speed.low=0")
+    ended = call("validate", "reward=speed_on_track", *speeds)
+    assert ended.code == 0, ended.stderr
+
+
 @pytest.mark.parametrize(
     ("track", "own"),
     [("track.file=oval.npy", False), ("track.file=square.yaml", True)],
