@@ -165,6 +165,22 @@ def test_a_resumed_run_is_shown_as_running(store, mlflow, tmp_path, killed, wait
     assert tracker.failure is None
 
 
+def test_a_run_that_had_ended_and_goes_on_has_no_end_and_its_new_rows_at_once(
+    store, mlflow, tmp_path, resumed, wait_until
+):
+    resumed.finish("FINISHED")
+    ended = read_tracked_run(tmp_path)
+    assert ended.end_ms is not None
+    again = reopened(store, tmp_path)
+    write_rows(tmp_path, rows_until(12)[10:])
+    wait_until(lambda: points(mlflow, resumed.run_id) == logged_until(12))
+    assert mlflow.get_run(resumed.run_id).info.status == "RUNNING"
+    assert read_tracked_run(tmp_path).end_ms is None
+    again.finish("FINISHED")
+    assert again.failure is None
+    assert mlflow.get_run(resumed.run_id).info.end_time > ended.end_ms
+
+
 def test_a_run_deleted_in_mlflow_is_not_recorded_and_says_so_in_one_line(
     store, mlflow, tmp_path, killed, caplog
 ):
