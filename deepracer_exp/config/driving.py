@@ -1,5 +1,6 @@
 """Track, action space, observation, randomization, episode rules and reward."""
 
+import math
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
@@ -283,6 +284,18 @@ class RandomizationConfig:
     real_car: CarRandomizationConfig | None = None
     car_share: Fraction = 1.0
     """Share of the cars that are randomized."""
+
+
+_GOLDEN_RATIO = (math.sqrt(5) - 1) / 2
+
+
+def car_differs(number: int, car_share: float) -> bool:
+    """Return whether a car, by its number among those on its track, is in the share that is randomized.
+
+    Multiples of the golden ratio, modulo 1, are spread evenly (Weyl's theorem), however many cars there are. Car 0 is
+    randomized with a share of 1 only.
+    """
+    return number * _GOLDEN_RATIO % 1 >= 1 - car_share
 
 
 QUANTITIES = {

@@ -24,7 +24,7 @@ from .observation import Features
 from .pictures import Pictures
 from .real_car import Servos
 from .rules import RaceRules, StepResult
-from .setup import RaceSetup
+from .setup import RaceSetup, places_of_cars
 from .state import Measures, checked_array
 from .trace_columns import OTHERS_PACKED, PACKED, RIVAL_PACKED
 from .trace_rows import Driven, Lengths, row_dtype, write_rows
@@ -90,7 +90,9 @@ class Race:
         self._period_s = setup.car.control_period_s
         self._floors = np.array([course.tracks[0].floor.friction for course in setup.courses])
         self._batch = CarBatch(setup.car, n_cars, threads, self._floors[self.rules.course])
-        self._reward_function = RewardFunction(setup.reward, n_cars, setup.reward_time_limit_s, prints)
+        self._reward_function = RewardFunction(
+            setup.reward, n_cars, setup.reward_time_limit_s, prints, first_car=first_car
+        )
         self.others: RaceOthers | None = None
         if setup.others is not None:
             kind = RaceOthers if setup.others.rivals is None else RaceRival
@@ -102,7 +104,9 @@ class Race:
             setup.observation, self.rules.tracks, steering_max_deg, high[1], setup.observation_parts
         )
         numbers = self.cars.tolist()
-        randomizations = of_each_car(randomizations or [setup.randomization] * n_cars, numbers)
+        weights = [course.weight for course in setup.courses]
+        places = places_of_cars(weights, first_car + n_cars)[first_car:].tolist()
+        randomizations = of_each_car(randomizations or [setup.randomization] * n_cars, places)
         of_car = [randomization.real_car for randomization in randomizations]
         fixed = setup.real_car
         real_car = RealCarRandomization(of_car, numbers, self._batch, fixed, setup.late_steps)

@@ -9,7 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.config.driving import EpisodeConfig, ObservationConfig, RandomizationConfig
+from deepracer_exp.config.driving import (
+    EpisodeConfig,
+    ObservationConfig,
+    RandomizationConfig,
+    car_differs,
+)
 from deepracer_exp.config.evaluation import RealCarConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.racing import RaceConfig
@@ -74,6 +79,26 @@ def deal(weights: Sequence[float]) -> Iterator[int]:
 def courses_of_cars(weights: Sequence[float], cars: int) -> NDArray[np.intp]:
     """Return the course of each of the first `cars` cars as in `deal`, shape (cars,)."""
     return np.fromiter(itertools.islice(deal(weights), cars), np.intp, cars)
+
+
+def places_of_cars(weights: Sequence[float], cars: int) -> NDArray[np.intp]:
+    """Return the number of each of the first `cars` cars among those on its course, from 0, shape (cars,)."""
+    course = courses_of_cars(weights, cars)
+    order = np.argsort(course, kind="stable")
+    places = np.empty(cars, np.intp)
+    places[order] = np.arange(cars) - np.searchsorted(course[order], course[order])
+    return places
+
+
+def usual_cars(weights: Sequence[float], car_share: float, cars: int) -> NDArray[np.bool_]:
+    """Return which of the first `cars` cars drive on usual conditions, whose lap times compare, shape (cars,).
+
+    They are those that `randomization.car_share` leaves as they are; on a course where it leaves none, all.
+    """
+    course = courses_of_cars(weights, cars)
+    differs = np.array([car_differs(place, car_share) for place in places_of_cars(weights, cars).tolist()])
+    alone = np.bincount(course, ~differs, len(weights)) == 0
+    return ~differs | alone[course]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -250,8 +250,9 @@ def _crashes(view: LogView) -> Finding | None:
     densest = places[tree.query_ball_point(places, CRASH_PLACE_M, return_length=True).argmax()]
     here = rows.iloc[tree.query_ball_point(densest, CRASH_PLACE_M)]
     crashed = rows["episode"].nunique()
-    waypoint = int(here["closest_waypoint"].median())
     x_m, y_m = here[["X", "Y"]].median()
+    nearest = np.hypot(here["X"] - x_m, here["Y"] - y_m).to_numpy().argmin()
+    waypoint = int(here["closest_waypoint"].iloc[nearest])
     where = ", at no place often."
     if len(here) >= off_track.LEAST:
         where = f", {len(here)} times at one place: waypoint {waypoint} (x {x_m:.2f} m, y {y_m:.2f} m)."

@@ -178,9 +178,10 @@ def _decided(view: LogView, decision: Mapping[str, Any]) -> Finding:
     if rule == "reliable":
         advice = "Train longer: this rule ends a training when the car is reliable, not when it is fast."
     elif rule == "overfitting":
-        sentence += _faster_laps(view)
+        judged = overfitting(view.judged, view.stopping)
+        sentence += _faster_laps(view, judged)
         cost = values.get("held_out_completion_before", 0.0) - values.get("held_out_completion_since", 0.0)
-        advice = _overfitting_cures(view, overfitting(view.judged, view.stopping))
+        advice = _overfitting_cures(view, judged)
     elif rule == "laps_slower":
         before_s, since_s = values.get("lap_time_s_before", 1.0), values.get("lap_time_s_since", 1.0)
         cost = 100 * (since_s / before_s - 1)
@@ -192,8 +193,12 @@ def _decided(view: LogView, decision: Mapping[str, Any]) -> Finding:
         cost = 100 - values.get("completion", 0.0)
         advice = f"Training longer will not help: {_cures(view)}"
         if rule == "collapsed":
+            is_sac = "sac_alpha" in (view.recording.hyperparameters or {})
+            bonus = (
+                "temperature (algorithm.alpha)" if is_sac else "entropy coefficient (algorithm.entropy_coeff)"
+            )
             advice = (
-                "Raise the entropy coefficient (algorithm.entropy_coeff) or lower the learning rate (algorithm.lr): "
+                f"Raise the {bonus} or lower the learning rate (algorithm.lr): "
                 "the policy has settled before it could drive."
             )
     limits = {key: limit for key, limit in decision["thresholds"].items() if isinstance(limit, int | float)}
@@ -257,19 +262,21 @@ def _overfits(view: LogView) -> Finding | None:
         sentence += " while the reward of the training holds: it overfits"
         values |= judged.decision.values
         thresholds |= {"return_drop": judged.rule.return_drop, "patience": judged.rule.patience}
-    sentence += f".{_faster_laps(view)}"
+    sentence += f".{_faster_laps(view, judged)}"
     return Finding(
         "overfits", sentence, values, thresholds, fallen, f"{sentence} {_overfitting_cures(view, judged)}"
     )
 
 
-def _faster_laps(view: LogView) -> str:
-    """Return a sentence if the evaluated laps became faster meanwhile, else ""."""
-    laps_s: Values = view.judged["eval_lap_time_s"].dropna().to_numpy(np.float64)
-    first_s, now_s = (
-        float(laps_s[:3].mean()) if len(laps_s) else 0.0,
-        float(laps_s[-3:].mean() if len(laps_s) else 0),
-    )
+def _faster_laps(view: LogView, judged: Overfitting | None) -> str:
+    """Return a sentence if the evaluated laps became faster since completion was best, else ""."""
+    evaluated = view.judged.dropna(subset="eval_lap_time_s")
+    laps_s: Values = evaluated["eval_lap_time_s"].to_numpy(np.float64)
+    best = 0 if judged is None else judged.best_iteration
+    before_s = laps_s[evaluated["iteration"].to_numpy() <= best][-3:]
+    if not len(before_s):
+        return ""
+    first_s, now_s = float(before_s.mean()), float(laps_s[-3:].mean())
     if first_s - now_s < LEAST_LOSS_S:
         return ""
     return (
@@ -281,9 +288,9 @@ def _overfitting_cures(view: LogView, judged: Overfitting | None) -> str:
     """Return remedies for a policy that became less reliable."""
     if view.run is None:
         return f"Take {_instead(view)}, and clone it at a lower learning rate."
-    words = "Clone it with randomization=sim2real, at a tenth of the learning rate, so that it meets such conditions"
-    if view.run.randomized:
-        words = "Clone it at a tenth of the learning rate"
+    words = "Clone it at a tenth of the learning rate"
+    if not view.run.randomized:
+        words = f"{words}, with randomization=sim2real, so that all its cars meet such conditions"
     earlier = None if judged is None else _reliable_checkpoint(view, judged)
     return f"{words}; or take {earlier}." if earlier is not None else f"{words}."
 
@@ -365,8 +372,8 @@ class RisingEntropy:
 def rising_entropy(iterations: pd.DataFrame, action_count: int | None) -> RisingEntropy | None:
     """Test whether entropy has risen since it was lowest; None: it has not, or there are too few iterations to say.
 
-    The entropies since then are compared with their order (Kendall's tau, one-sided), the chance of a false alarm
-    divided by the number of possible starts (Bonferroni), as for `slower_laps`.
+    Kendall's tau (one-sided) tests the entropies since then for a rising trend, at a significance level divided by the
+    number of possible starts (Bonferroni), as in `slower_laps`.
 
     Args:
         iterations: a row each, with `iteration` and `entropy` in nats.

@@ -117,8 +117,9 @@ def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return commands for a run folder with its summary.json, each with its purpose, the first to be used first."""
     word, name, config = run_word(run), own_word(run), read_config(run)
     resume, clone = command_line("resume", name, config), command_line("clone", word, config)
-    # A clone has had its second phase, and a policy for the physical car changing conditions of its own.
-    is_first = not (run / LINEAGE).exists() and not (config.get("randomization") or {}).get("real_car")
+    # A clone has had its second phase; a policy for changing conditions alone, or for the real car, needs none.
+    met_all = is_randomized(config) or bool((config.get("randomization") or {}).get("real_car"))
+    is_first = not (run / LINEAGE).exists() and not met_all
     steps = []
     if summary["iteration"]:
         evaluate = command_line("evaluate", word, config, OF_POLICY)
@@ -152,7 +153,7 @@ def next_steps(run: Path, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         resume = command_line("resume", name, config, [group for group in GROUPS if group != "stopping"])
         if rule == "reliable" and not config["evaluation"].get("real_car"):
             return [(f"{resume} stopping=entropy", "train longer, until nothing improves any more"), *steps]
-        if rule == "overfitting" and not is_randomized(config):
+        if rule == "overfitting" and not met_all:
             return [(f"{clone} {SECOND_PHASE}", STABLE), *steps[:-1]]
         steps.append((f"{resume} stopping=none", "continue it until its budget is used"))
     else:

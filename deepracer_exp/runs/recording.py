@@ -115,7 +115,7 @@ class RunRecording:
     decision: Mapping[str, Any] | None = None
     """The decision of the stopping rule that ended the run, as in summary.json; None if no rule did."""
     randomized: bool = False
-    """Whether its training varied the conditions (`randomization`)."""
+    """Whether its training varied the conditions for all cars (`randomization`)."""
     usual_episodes: NDArray[np.int64] | None = None
     """Episodes on usual conditions, where only a share of the cars differed from them; None: all were alike."""
     counted: pd.DataFrame | None = None
@@ -230,7 +230,7 @@ def _columns(
     left: dict[Path, tuple[pq.ParquetFile, int]],
     problems: list[LogProblem],
 ) -> dict[str, Any] | None:
-    """Return the columns of opened files from a row of each on; None: one cannot be read, and is left no more.
+    """Return the columns of opened files, each from its first wanted row; None: one is unreadable, and out of `left`.
 
     A column is read from all files before the next: the memory that it was unpacked in is used again.
     """

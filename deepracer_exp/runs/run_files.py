@@ -39,7 +39,7 @@ LINEAGE = "lineage.json"
 """File in a clone's folder."""
 REWARD_PRINTS = "reward_prints.log"
 RUNNING = ".running"
-"""Locked by the process that trains in the folder, and there as long as it does."""
+"""Lock file of the process that trains in the folder; removed when it ends."""
 HEARTBEAT = ".heartbeat"
 CHECKPOINTS, TRACE, EVALUATIONS, FILMS, CRASH_DUMPS = "checkpoints", "trace", "evaluations", "films", "faults"
 EXPORTS, TENSORBOARD, WANDB = "export", "tensorboard", "wandb"
@@ -145,9 +145,10 @@ def sees_pictures(config: Mapping[str, Any]) -> bool:
 
 
 def is_randomized(config: Mapping[str, Any]) -> bool:
-    """Return whether a run's configuration varies the conditions of its training."""
-    ranges = (config.get("randomization") or {}).values()
-    return any(isinstance(bounds, list) and bounds[0] != bounds[-1] for bounds in ranges)
+    """Return whether a run's configuration varies the conditions of its training for all cars."""
+    values = config.get("randomization") or {}
+    varied = any(isinstance(bounds, list) and bounds[0] != bounds[-1] for bounds in values.values())
+    return varied and values.get("car_share", 1) == 1
 
 
 def read_object(file: Path) -> dict[str, Any]:

@@ -39,7 +39,7 @@ METRICS: Mapping[str, tuple[str, str]] = {
         "train/lap_share",
         "share of recent episodes with a lap (0 to 1), the lowest of all tracks",
     ),
-    "best_lap_time_s": ("train/best_lap_time_s", "fastest exploring lap so far"),
+    "best_lap_time_s": ("train/best_lap_time_s", "fastest exploring lap so far on usual conditions"),
     "mean_lap_time_s": ("train/mean_lap_time_s", "mean time of the iteration's exploring laps"),
     "laps": ("train/laps", "exploring laps completed so far"),
     "mean_return": ("train/mean_return", "mean sum of rewards of finished episodes"),

@@ -20,7 +20,7 @@ _FEWEST_EPISODES = 10  # with fewer, the mean completion says little about the p
 
 
 def track_names(setup: RaceSetup) -> list[str]:
-    """Return the names of courses: of a single one its own, which a file may set; of several those of the options."""
+    """Return the names of courses: the options' names, or for a single course its own, which a file may set."""
     courses = setup.courses
     return [course.name for course in courses] if len(courses) > 1 else [setup.track.name]
 
@@ -39,6 +39,8 @@ class Finished:
     """Whether the lap was completed."""
     time_s: np.ndarray
     """Seconds since the reset (`rules.lap_clock_s`): the lap time where the lap was completed."""
+    on_usual: np.ndarray
+    """Whether the car drives on usual conditions (`usual_cars`)."""
 
     def on(self, track: int) -> "Finished":
         """Return the episodes of one track."""
@@ -47,7 +49,7 @@ class Finished:
 
 
 class Record:
-    """Counts of finished episodes and laps, the fastest lap, and the last episodes."""
+    """Counts of finished episodes and laps, the fastest lap on usual conditions, and the last episodes."""
 
     def __init__(self, remembered: int):
         """Start at zero.
@@ -70,8 +72,9 @@ class Record:
         self.finished += len(finished.lap)
         self.laps += int(finished.lap.sum())
         self._laps_of_last.extend(finished.lap.tolist())
-        if finished.lap.any():
-            fastest = float(finished.time_s[finished.lap].min())
+        laps_s = finished.time_s[finished.lap & finished.on_usual]
+        if len(laps_s):
+            fastest = float(laps_s.min())
             self.best_lap_s = fastest if self.best_lap_s is None else min(self.best_lap_s, fastest)
 
     def state_dict(self) -> dict[str, Any]:
@@ -99,9 +102,17 @@ class RunMetrics:
         remembered: number of last finished episodes in `lap_share`.
         all: the episodes of all tracks.
         tracks: those of each track.
+        on_usual: whether each car drives on usual conditions, (n_cars,); lap times compare among these.
     """
 
-    def __init__(self, names: Sequence[str], n_cars: int, step_s: float, stopping: StoppingConfig):
+    def __init__(
+        self,
+        names: Sequence[str],
+        n_cars: int,
+        step_s: float,
+        stopping: StoppingConfig,
+        on_usual: np.ndarray | None = None,
+    ):
         """Start without episodes.
 
         Args:
@@ -109,6 +120,7 @@ class RunMetrics:
             n_cars: cars over all processes.
             step_s: simulated seconds of a control step.
             stopping: its rule decides over how many episodes `lap_share` is taken.
+            on_usual: whether each car drives on usual conditions (`usual_cars`), (n_cars,); None: all do.
         """
         self.track_names = names
         self.labels = track_labels(names) if len(names) > 1 else []
@@ -116,6 +128,7 @@ class RunMetrics:
         self.all = Record(self.remembered)
         self.tracks = tuple(Record(self.remembered) for _ in names)
         self._last: list[dict[str, float | None]] = [{} for _ in self.labels]
+        self.on_usual = np.ones(n_cars, bool) if on_usual is None else on_usual
         self._number = np.full(n_cars, -1)
         self._next_number = 0
         self._step_s = step_s
@@ -219,6 +232,7 @@ class RunMetrics:
             progress=ends[:, PACKED["progress"]],
             lap=ends[:, PACKED["episode_status"]] == STATUS_CODE["lap_complete"],
             time_s=lap_clock_s(ends[:, PACKED["steps"]], self._step_s),
+            on_usual=self.on_usual[ends[:, PACKED["car"]].astype(np.int64)],
         )
         self.all.add(finished)
         for number, record in enumerate(self.tracks):

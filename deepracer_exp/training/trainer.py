@@ -22,7 +22,7 @@ from deepracer_exp.collectors.collector import Collector, open_collector
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.env.others.placement import placements_table
-from deepracer_exp.env.setup import RaceSetup
+from deepracer_exp.env.setup import RaceSetup, usual_cars
 from deepracer_exp.env.trace_columns import PACKED, to_table
 from deepracer_exp.errors import RunFailed, reading
 from deepracer_exp.evaluation.results import NOT_EVALUATED, Evaluation
@@ -140,7 +140,15 @@ class Trainer:
         self.budget = Budget(experiment.budget)
         collector = experiment.collector
         self.metrics = RunMetrics(
-            track_names(setup), collector.cars, experiment.car.control_period_s, experiment.stopping
+            track_names(setup),
+            collector.cars,
+            experiment.car.control_period_s,
+            experiment.stopping,
+            usual_cars(
+                [course.weight for course in setup.courses],
+                experiment.randomization.car_share,
+                collector.cars,
+            ),
         )
         self._trace = trace_writer(folder.path / TRACE, experiment.trace)
         # More threads do not speed up networks of features, and on a busy machine they wait for one another: an

@@ -7,7 +7,7 @@ import pytest
 
 from deepracer_exp.env.gym_env import DeepRacerEnv, DeepRacerVectorEnv
 from deepracer_exp.env.race import Race
-from deepracer_exp.env.setup import courses_of_cars
+from deepracer_exp.env.setup import courses_of_cars, usual_cars
 from deepracer_exp.env.trace_columns import PACKED
 from deepracer_exp.errors import BadInput
 from tests.env.conftest import drive, spied
@@ -55,6 +55,24 @@ def test_the_number_of_processes_does_not_change_a_cars_course(setup_of):
     whole = Race(setup, 12).rules.course
     parts = [Race(setup, 4, first_car=first).rules.course for first in (0, 4, 8)]
     np.testing.assert_array_equal(np.concatenate(parts), whole)
+
+
+@pytest.mark.parametrize("tracks", [1, 2, 3, 5, 13, 21, 34, 68])
+def test_about_the_same_share_of_the_cars_differs_on_each_track(tracks):
+    course = courses_of_cars([1.0] * tracks, 256)
+    for share in (0.25, 0.5, 0.75):
+        usual = usual_cars([1.0] * tracks, share, 256)
+        for one in range(tracks):
+            count, differ = np.count_nonzero(course == one), np.count_nonzero(~usual[course == one])
+            assert abs(differ - share * count) <= 2
+            assert 0 < differ < count or share == 0.25
+
+
+def test_on_a_track_whose_cars_all_differ_all_laps_count():
+    assert usual_cars([1, 1], 1.0, 4).all()
+    # Car 0 of each track differs with a share of 1 only.
+    assert usual_cars([1, 1], 0.99, 4).tolist() == [True, True, False, False]
+    assert usual_cars([1, 1], 0.99, 2).all()
 
 
 # --- Cars of several courses beside one another

@@ -9,7 +9,8 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.driving import OFF, QUANTITIES, RandomizationConfig
 from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.env.race import Race
-from deepracer_exp.env.randomization.car_randomization import CarStreams, of_each_car
+from deepracer_exp.env.randomization.car_randomization import CarStreams
+from deepracer_exp.env.setup import usual_cars
 from deepracer_exp.env.trace_columns import PACKED
 from deepracer_exp.errors import BadInput
 from deepracer_exp.sim.batch import CarBatch
@@ -135,12 +136,18 @@ def test_a_share_of_the_cars_differs_and_the_others_drive_as_without_randomizati
     np.testing.assert_array_equal(some[:, as_configured], none[:, as_configured])
 
 
-@pytest.mark.parametrize("tracks", [2, 3, 5])
-def test_cars_differ_by_the_same_share_on_each_of_several_tracks(tracks):
-    config = make_setup("randomization=mixed", "action_space=continuous").randomization
-    differs = [each is config for each in of_each_car([config] * 240, range(240))]
-    for course in range(tracks):
-        assert 0.4 <= np.mean(differs[course::tracks]) <= 0.6
+def test_the_cars_of_a_race_differ_where_they_are_said_to():
+    names = ("reinvent_base", "Oval_track", "Bowtie_track")
+    setup = make_setup("randomization=mixed", "action_space=continuous", f"track=[{','.join(names)}]")
+    race = Race(setup, 12)
+    race.reset()
+    plain = (race.randomization.values == list(OFF.values())).all(axis=1)
+    np.testing.assert_array_equal(plain, usual_cars([1.0] * 3, 0.5, 12))
+    parts = [Race(setup, 6, first_car=first) for first in (0, 6)]
+    for part in parts:
+        part.reset()
+    drawn = np.concatenate([part.randomization.values for part in parts])
+    np.testing.assert_array_equal(drawn, race.randomization.values)
 
 
 def test_switching_one_quantity_off_leaves_the_draws_of_the_others():

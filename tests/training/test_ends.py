@@ -7,6 +7,7 @@ import shutil
 import signal
 import threading
 
+import numpy as np
 import pytest
 
 from deepracer_exp.config.compose import compose_experiment
@@ -126,7 +127,7 @@ def test_the_lines_to_paste_after_a_training_work(trained, copied, call):
     ids=" ".join,
 )
 def test_a_run_has_pictures_as_soon_as_it_has_an_iteration(train_here, tmp_path, overrides):
-    write_pictures(tmp_path, build_courses(compose_experiment([])[0]))
+    write_pictures(tmp_path, build_courses(compose_experiment([])[0]), np.ones(256, bool))
     assert not list(tmp_path.iterdir())
     ended = train_here("budget.iterations=1", *overrides)  # without a lap
     assert ended.code == 0, ended.stderr

@@ -77,6 +77,15 @@ def test_finished_episodes_come_in_the_order_of_their_ends():
     assert book.all.best_lap_s == pytest.approx(2 / 15)
 
 
+def test_the_fastest_lap_is_none_of_a_car_that_differs():
+    for usual, fastest in (([True, False, True, False], 4), ([True] * 4, 1), (None, 1)):
+        on_usual = None if usual is None else np.array(usual)
+        book = RunMetrics(["Oval_track"], 4, 1 / 15, RULE, on_usual)
+        book.enter(Driven([[9], [1] * 9, [4, 9], [2, 9]]).batch(9))
+        assert book.all.best_lap_s == pytest.approx(fastest / 15)
+        assert book.all.laps == 12
+
+
 def test_the_share_of_laps_is_known_only_once_enough_episodes_have_ended():
     driven, book = Driven([[2] * 20]), book_of(1, remembered=3)
     book.enter(driven.batch(5))
@@ -167,7 +176,8 @@ def test_reliable_is_what_is_reliable_on_every_track():
 def ended(*episodes: tuple[int, float, float]) -> Finished:
     """Episodes as (track, progress, seconds); those of 100 per cent are laps."""
     track, progress, time_s = np.array(episodes, float).reshape(-1, 3).T
-    return Finished(track.astype(int), np.zeros(len(track)), progress, progress == 100, time_s)
+    usual = np.ones(len(track), bool)
+    return Finished(track.astype(int), np.zeros(len(track)), progress, progress == 100, time_s, usual)
 
 
 def test_completion_counts_before_speed_and_a_faster_lap_before_a_slower_one():

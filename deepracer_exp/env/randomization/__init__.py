@@ -1,1 +1,1 @@
-"""Randomization of cars, of their pictures, and of the physical car's ways."""
+"""Domain randomization of cars and their pictures, and towards the physical car."""

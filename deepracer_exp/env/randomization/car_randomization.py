@@ -1,6 +1,5 @@
 """Domain randomization: what each car draws for each of its episodes, from its own random streams."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from enum import IntEnum
@@ -9,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deepracer_exp.config.driving import OFF, QUANTITIES, RandomizationConfig
+from deepracer_exp.config.driving import OFF, QUANTITIES, RandomizationConfig, car_differs
 from deepracer_exp.env.state import checked_array
 from deepracer_exp.sim.batch import CarBatch
 
@@ -22,9 +21,6 @@ _SAG_S = 20.0
 _COLUMN = {name: column for column, name in enumerate(QUANTITIES)}
 _KNOWN = ("last_steering", "last_speed")
 """Features that are commands, not measurements, and therefore exact."""
-
-
-_GOLDEN_RATIO = (math.sqrt(5) - 1) / 2
 
 # Numbers drawn from a generator at once: one number from each of 256 generators would cost 0.5 ms a step.
 _BLOCK = 128
@@ -107,16 +103,14 @@ class StepNoise:
         return self._block[:, place]
 
 
-def of_each_car(configs: Sequence[RandomizationConfig], cars: Sequence[int]) -> list[RandomizationConfig]:
+def of_each_car(configs: Sequence[RandomizationConfig], places: Sequence[int]) -> list[RandomizationConfig]:
     """Return each car's randomization, (N,): the configured one, or none for cars outside `car_share`.
 
-    `cars` are their numbers over all processes. Multiples of the golden ratio, modulo 1, are spread evenly over all
-    cars, and over every second or third of them (Weyl's theorem), so that on each of several tracks about the same
-    share differs. Car 0 differs with a share of 1 only.
+    `places` are their numbers among those on their courses, see `places_of_cars`.
     """
     return [
-        config if car * _GOLDEN_RATIO % 1 >= 1 - config.car_share else _without(config)
-        for config, car in zip(configs, cars, strict=True)
+        config if car_differs(place, config.car_share) else _without(config)
+        for config, place in zip(configs, places, strict=True)
     ]
 
 

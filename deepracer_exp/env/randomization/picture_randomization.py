@@ -35,10 +35,9 @@ _OBJECT_LOW_M, _OBJECT_HIGH_M = np.array([0.1, 0.1, 0.1]), np.array([0.6, 0.6, 0
 _PLACES, _CLEARANCE_M, _BESIDE_M = 256, 0.05, 1.6
 """Places of objects per track, their least distance from road and walls, and largest from the border."""
 _NOISE_NUMBERS = 2**18
-"""Standard normal numbers that all pictures take their noise from: drawing new ones would take longer than the
-picture."""
+"""Standard normal numbers that all pictures share as noise: drawing new ones would take longer than the picture."""
 _NEXT_PICTURE = 7919
-"""Offset between the noise of successive pictures, in these numbers."""
+"""Offset among these numbers from one picture to the next."""
 
 Floats = NDArray[np.float64]
 

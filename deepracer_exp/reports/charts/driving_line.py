@@ -35,7 +35,7 @@ def lap_line(view: LogView) -> Chart | None:
     lap = view.fastest_lap(*columns)
     if lap is None or view.course is None:
         return None
-    row = view.episodes.loc[view.episodes["lap_time_s"].idxmin()]
+    row = view.episodes.loc[view.comparable["lap_time_s"].idxmin()]
     moving = lap[lap["track_speed_mps"].notna()]
     hover = [
         f"step {step.steps:.0f}, waypoint {step.closest_waypoint}, {step.progress:.1f}%\n"
@@ -324,8 +324,8 @@ def waypoint_map(view: LogView) -> Chart | None:
 
 
 def _laps_or_recent(view: LogView, *columns: str) -> tuple[pd.DataFrame, str]:
-    """Return the rows of complete laps, or without any those of the last third, and which they are."""
-    complete = view.episodes["complete"].to_numpy(bool)
+    """Return the rows of complete laps on usual conditions, or else those of the last third, and which they are."""
+    complete = view.episodes["complete"].to_numpy(bool) & view.on_usual
     if complete.any():
         return view.of_episodes(complete, *columns), count(int(complete.sum()), "complete lap")
     return view.recent(*columns), "last third of the iterations"

@@ -20,15 +20,15 @@ _MANY = 500
 
 
 class Trace(dict[str, Any]):
-    """Points, bars or cells, by the keys of plotly.js; Plotly's own objects cost seconds a page."""
+    """A plotly.js trace (points, bars or cells) as a plain dict; Plotly's own objects cost seconds a page."""
 
 
 class Shape(dict[str, Any]):
-    """A line or an area without data, by the keys of plotly.js."""
+    """A plotly.js shape: a line or an area without data."""
 
 
 class Annotation(dict[str, Any]):
-    """A text at a place, by the keys of plotly.js."""
+    """A plotly.js annotation: a text at a place."""
 
 
 Layer: TypeAlias = Trace | Shape | Annotation
@@ -261,7 +261,7 @@ def _data(trace: Trace) -> pd.DataFrame:
 
 
 def _light(values: ArrayLike) -> NDArray[np.float32]:
-    """Return values in half the size; more digits cannot be seen."""
+    """Return values in single precision, half the size; more digits cannot be seen."""
     return np.asarray(values, dtype=np.float32)
 
 

@@ -56,11 +56,12 @@ _STARTS = 20
 
 def lap_time_histogram(view: LogView) -> Chart | None:
     """Draw the lap times of all complete laps, and the probability of fast ones."""
-    laps = view.episodes[view.episodes["lap_time_s"].notna()]
+    laps = view.comparable[view.comparable["lap_time_s"].notna()]
     if not len(laps):
         return None
     late = laps[thirds(view.episodes["iteration"].to_numpy())[laps.index] == 2]
-    parts = {"All complete laps": laps}
+    alike = " on usual conditions" if len(view.comparable) < len(view.episodes) else ""
+    parts = {f"All complete laps{alike}": laps}
     if len(laps) > len(late) >= _ENOUGH:
         parts["Of the last third of the iterations"] = late
     times_s = [part["lap_time_s"].to_numpy(np.float64) for part in parts.values()]
@@ -236,7 +237,7 @@ def _loss_in_words(sectors: Sequence[Sector], delta: pd.DataFrame) -> str:
 
 def correlations(view: LogView) -> Chart | None:
     """Draw lap time against other figures of a lap, with linear and quadratic fits, the closest first."""
-    if view.episodes["lap_time_s"].notna().sum() < 3:
+    if view.comparable["lap_time_s"].notna().sum() < 3:
         return None
     laps = _lap_columns(view)
     varying = [name for name in LAP_COLUMNS if laps[name].nunique() > 1]
@@ -277,8 +278,8 @@ def correlations(view: LogView) -> Chart | None:
 
 
 def _lap_columns(view: LogView) -> pd.DataFrame:
-    """Return `lap_time_s` and `LAP_COLUMNS` of each complete lap."""
-    wanted = view.episodes["lap_time_s"].notna().to_numpy()
+    """Return `lap_time_s` and `LAP_COLUMNS` of each `comparable` lap."""
+    wanted = view.comparable["lap_time_s"].reindex(view.episodes.index).notna().to_numpy()
     laps, n = np.flatnonzero(wanted), len(wanted)
     begin, end = view.begins[laps], view.begins[laps + 1] - 1
     part = {name: view.steps[name].to_numpy(np.float64) for name in _OF_STEPS}
@@ -310,6 +311,8 @@ def _lap_columns(view: LogView) -> pd.DataFrame:
 
 def start_position(view: LogView) -> Chart | None:
     """Draw completion and lap time by start position."""
+    if view.laps_only:
+        return None
     first = view.steps[["lap_position", "progress"]].iloc[np.flatnonzero(first_rows(view.steps))]
     # Starts at one position differ by where the car settles, so that a part begins half of its width earlier.
     place = (first["lap_position"] - first["progress"] / 100.0).to_numpy(np.float64) * _STARTS
@@ -326,13 +329,14 @@ def start_position(view: LogView) -> Chart | None:
         ("Progress, mean", "per cent of the lap", [bars(x, completion, BLUE, width=width)]),
         ("Episodes", "episodes", [bars(x, groups.size(), FAINT, width=width)]),
     ]
-    laps = episodes[episodes["lap_time_s"].notna()]
+    laps = episodes[episodes["lap_time_s"].notna() & episodes.index.isin(view.comparable.index)]
     if len(laps):
+        times_s = laps.groupby("start")["lap_time_s"].agg(["mean", "min"]).reindex(completion.index)
         laps = laps.iloc[subsample(len(laps), 1500)]
         timed: list[Layer] = [
             points(laps["at"], laps["lap_time_s"], SKY, size=5),
-            points(x, groups["lap_time_s"].mean(), BLUE, "mean", symbol="diamond", size=9),
-            points(x, groups["lap_time_s"].min(), VERMILION, "best", symbol="star", size=11),
+            points(x, times_s["mean"], BLUE, "mean", symbol="diamond", size=9),
+            points(x, times_s["min"], VERMILION, "best", symbol="star", size=11),
         ]
         shown.append(("Lap times", "lap time, s", timed))
     where = "start, per cent of the track"

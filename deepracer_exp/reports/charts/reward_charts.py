@@ -184,6 +184,8 @@ def reward_terms(view: LogView, terms: pd.DataFrame) -> Chart | None:
 
 def reward_distribution(view: LogView) -> Chart | None:
     """Draw the distributions of rewards over steps and over episodes."""
+    if view.laps_only:
+        return None
     rewards = view.driven("reward")["reward"].dropna().to_numpy(np.float64)
     episodes = view.episodes[view.episodes["ended"]]
     if not len(rewards) or not len(episodes):
@@ -283,7 +285,7 @@ def discount_factors(view: LogView) -> Chart | None:
     if not len(episodes):
         return None
     complete = bool(episodes["lap_time_s"].notna().any())
-    longest = episodes["lap_time_s"].idxmin() if complete else episodes["progress"].idxmax()
+    longest = view.comparable["lap_time_s"].idxmin() if complete else episodes["progress"].idxmax()
     count = int(episodes.loc[longest, "steps"])
     ahead = np.arange(0, max(int(1.5 * count), 60), max(1, count // 150))
     layers: list[Layer] = []

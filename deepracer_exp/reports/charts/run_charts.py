@@ -99,7 +99,7 @@ def _on_grid(iterations: pd.DataFrame, column: str, grid: Values) -> Values:
 
 
 def _best_laps(groups: Mapping[str, Sequence[LogView]]) -> list[Panel]:
-    best_s = [[float(view.episodes["lap_time_s"].min()) for view in some] for some in groups.values()]
+    best_s = [[float(view.comparable["lap_time_s"].min()) for view in some] for some in groups.values()]
     if not np.isfinite(np.concatenate(best_s)).any():
         return []
     places = [x + 0.5 * ((np.arange(len(laps)) + 0.5) / len(laps) - 0.5) for x, laps in enumerate(best_s)]

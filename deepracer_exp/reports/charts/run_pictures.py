@@ -65,11 +65,13 @@ def driven_lines(
     trace: pd.DataFrame,
     tracks: Mapping[str, Track],
     boxes_of: Callable[[Track, int], NDArray[np.float64]] | None = None,
+    on_usual: NDArray[np.bool_] | None = None,
 ) -> Figure:
     """Draw the best episode of each track of a trace: its fastest complete lap, or the episode that drove farthest.
 
     Lines are coloured by measured speed, on one scale; a track that was not driven on is shown empty. `boxes_of`
-    returns the corners of an episode's boxes on a track, (k, 4, 2); None: there are none.
+    returns the corners of an episode's boxes on a track, (k, 4, 2); None: there are none. `on_usual` says of each car
+    whether it drives on usual conditions: laps of the others are drawn on a track that has none of these.
     """
     shown = []
     for name, track in tracks.items():
@@ -79,6 +81,9 @@ def driven_lines(
             shown.append(TrackLines(track, "not driven", ()))
             continue
         laps = table["lap_time_s"]
+        if on_usual is not None:
+            usual = on_usual[table["car"].to_numpy()]
+            laps = laps.where(usual) if laps[usual].notna().any() else laps
         best = laps.idxmin() if laps.notna().any() else table["progress"].idxmax()
         driven = here[here["episode"] == best]
         words = _result(table.loc[best])
@@ -96,7 +101,7 @@ def driven_lines(
 
 @dataclass(frozen=True)
 class _Margins:
-    """Room around axes in inches, as their words need it: a layout engine would take a third of the time of drawing."""
+    """Fixed margins around axes in inches: a layout engine would take a third of the drawing time."""
 
     left: float
     right: float

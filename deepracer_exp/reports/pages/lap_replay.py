@@ -87,8 +87,10 @@ def laps_of_log(view: LogView, rival: LogView | None) -> list[ReplayedLap]:
         raise BadInput(
             view.name, "has one complete lap only", "another run or log beside it to replay against"
         )
-    fastest = int(view.comparable["lap_time_s"].idxmin())
-    return [first, _lap(view, ordinary_lap(view.comparable, fastest), "an ordinary lap")]
+    fastest, laps = int(view.comparable["lap_time_s"].idxmin()), view.comparable
+    if laps["lap_time_s"].notna().sum() < 2:
+        laps = view.episodes
+    return [first, _lap(view, ordinary_lap(laps, fastest), "an ordinary lap")]
 
 
 def fastest_lap_of_log(view: LogView, beside: ReplayedLap | None = None) -> ReplayedLap:

@@ -160,7 +160,7 @@ def _policy(*scripts: bytes) -> str:
 
 @cache
 def _plotly() -> bytes:
-    """Return plotly.js as its Python package holds it, without the time of that package's import."""
+    """Return plotly.js from its Python package, without importing that."""
     spec = find_spec("plotly")
     assert spec is not None
     assert spec.origin is not None

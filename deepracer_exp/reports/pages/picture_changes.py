@@ -1,4 +1,4 @@
-"""Pictures that decide badly: a small, irrelevant change of them turns the wheels."""
+"""Robustness of a policy to its pictures: which decide badly, because a small, irrelevant change turns the wheels."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

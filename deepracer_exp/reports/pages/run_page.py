@@ -29,7 +29,7 @@ class RunReport(Callback):
 
     def on_train_end(self, trainer: Trainer) -> None:
         """Draw best_lap.png and learning.png."""
-        write_pictures(trainer.folder.path, trainer.setup.courses)
+        write_pictures(trainer.folder.path, trainer.setup.courses, trainer.metrics.on_usual)
 
     def on_run_end(self, trainer: Trainer, result: TrainResult) -> None:
         """Write report.html if `report` is on and the run is over, with at least one iteration."""
@@ -37,10 +37,11 @@ class RunReport(Callback):
             result.note = write_run_page(trainer.folder.path, trainer.experiment.car)
 
 
-def write_pictures(run_dir: Path, courses: Sequence[Course]) -> None:
+def write_pictures(run_dir: Path, courses: Sequence[Course], on_usual: NDArray[np.bool_]) -> None:
     """Draw `best_lap.png` and `learning.png` from the run's trace and metrics, if it has an iteration.
 
-    Without a trace (`trace=off`, or no lap yet with `trace=laps`) there is no best_lap.png.
+    Without a trace (`trace=off`, or no lap yet with `trace=laps`) there is no best_lap.png. `on_usual` says of each
+    car whether it drives on usual conditions.
     """
     # Imported here: it takes half a second, which the start of a training need not wait for.
     import pandas as pd
@@ -65,7 +66,7 @@ def write_pictures(run_dir: Path, courses: Sequence[Course]) -> None:
 
     figures = {LEARNING: learning_curves(pd.read_json(metrics_file, lines=True))}
     if trace is not None:
-        figures[BEST_LAP] = driven_lines(trace, tracks, boxes_of)
+        figures[BEST_LAP] = driven_lines(trace, tracks, boxes_of, on_usual)
     for name, figure in figures.items():
         # `savefig` draws a figure twice, the first time for its layout alone.
         FigureCanvasAgg(figure).print_png(run_dir / name)

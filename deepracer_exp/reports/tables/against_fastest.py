@@ -147,8 +147,12 @@ def fastest_in_words(view: LogView, folder: Path) -> str:
         return f"none: {error}"
     fastest = None if question is None else kept_lap(question)
     if fastest is None:
-        return f"not searched yet: deepracer-exp analyze {folder.name} --fastest"
+        return _not_searched(folder)
     return f"{fastest.lap_time_s:.2f} s; none is faster than {fastest.bound_s:.2f} s"
+
+
+def _not_searched(folder: Path) -> str:
+    return f"not searched yet: {COMMAND} analyze {shlex.quote(own_word(folder))} --fastest"
 
 
 def loss_in_words(view: LogView, folder: Path) -> str:
@@ -158,7 +162,7 @@ def loss_in_words(view: LogView, folder: Path) -> str:
     except BadInput as error:
         return f"none: {error}"
     if question is None or kept_lap(question) is None:
-        return f"not searched yet: {COMMAND} analyze {shlex.quote(own_word(folder))} --fastest"
+        return _not_searched(folder)
     lost = loss(view, folder)
     return f"no complete {view.lap_word} from the start line" if lost is None else lost_in_words(lost)
 

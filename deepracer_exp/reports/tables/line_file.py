@@ -32,7 +32,7 @@ def recorded_line(view: "LogView", episode: int | None) -> tuple["pd.DataFrame",
     """Return the line of a complete lap, a point per control step, and the lap's description.
 
     The points are those that the recording logs, at the front of the car. `episode` is a number of `view.episodes`;
-    None: the fastest.
+    None: the fastest of `LogView.comparable`.
 
     Raises:
         BadInput: there is no complete lap, or the episode is none.
@@ -40,7 +40,8 @@ def recorded_line(view: "LogView", episode: int | None) -> tuple["pd.DataFrame",
     laps = view.episodes[view.episodes["lap_time_s"].notna()].sort_values("lap_time_s", kind="stable")
     if laps.empty:
         raise BadInput(view.name, "has no complete lap with its steps", "a run or log with laps")
-    chosen = laps.iloc[0] if episode is None else _lap(view, laps, episode)
+    fastest = view.comparable["lap_time_s"].idxmin()
+    chosen = laps.loc[fastest] if episode is None else _lap(view, laps, episode)
     wanted = (view.episodes["episode"] == chosen["episode"]).to_numpy()
     rows = view.of_episodes(wanted, "X", "Y", "track_speed_mps", "progress")
     rows = rows.rename(columns={"X": "x_m", "Y": "y_m", "track_speed_mps": "speed_mps"})

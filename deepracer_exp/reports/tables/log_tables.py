@@ -106,8 +106,8 @@ def candidate_rows(view: LogView) -> Table:
 
 
 def best_laps(view: LogView) -> Table:
-    """Return the fastest laps of the training, or of races without one, the fastest first; those with resets last."""
-    columns, episodes = _LAP_COLUMNS, view.episodes
+    """Return the fastest `comparable` laps of the training, or of races without one; those with resets last."""
+    columns, episodes = _LAP_COLUMNS, view.comparable
     if not view.trained:
         columns = {"stream": ("Race", "")} | {k: v for k, v in columns.items() if k != "iteration"}
         columns |= {"resets": ("Resets", "d")} if episodes["reset_lap_time_s"].notna().any() else {}
@@ -219,14 +219,15 @@ def headline(view: LogView) -> str:
         count(len(view.steps), "control step"),
     )
     complete, put_back = view.episodes["complete"], view.episodes["resets"] > 0
-    laps, best_s = int((complete & ~put_back).sum()), view.episodes["lap_time_s"].min()
+    laps, best_s = int((complete & ~put_back).sum()), view.comparable["lap_time_s"].min()
     with_resets = int((complete & put_back).sum())
     if view.trained:
         sentence = f"{steps} of training in {finished} and {count(len(view.iterations), 'iteration')}"
         if view.untraced:
             sentence += f"; {count(view.untraced, 'more episode')} known from metrics files only"
             laps = int(view.iterations["complete"].sum())
-            best_s = view.iterations["lap_time_best_s"].min()
+            if view.run is None:  # all laps of a run of ours are in its trace
+                best_s = view.iterations["lap_time_best_s"].min()
     else:
         races = count(view.episodes["stream"].nunique(), "race")
         sentence = f"No training; {steps} in {finished} of {races}"

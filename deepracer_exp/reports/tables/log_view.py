@@ -239,17 +239,19 @@ class LogView:
 
     @cached_property
     def on_usual(self) -> NDArray[np.bool_]:
-        """Whether each of `episodes` was driven on usual conditions; all of them where cars do not differ in that."""
+        """Whether each of `episodes` was driven on usual conditions; all where no car differs, or all do."""
         usual = None if self.run is None or not self.trained else self.run.usual_episodes
+        everywhere = np.ones(len(self.episodes), bool)
         if usual is None:
-            return np.ones(len(self.episodes), bool)
-        return np.isin(self.episodes["episode"].to_numpy(), usual)
+            return everywhere
+        on_usual = np.isin(self.episodes["episode"].to_numpy(), usual)
+        return on_usual if on_usual.any() else everywhere
 
     @cached_property
     def comparable(self) -> pd.DataFrame:
-        """Episodes whose laps compare: those `on_usual`, or all where fewer than two of these are laps."""
+        """Episodes whose laps compare: those `on_usual`, or all where none of these is a lap."""
         alike = self.episodes[self.on_usual]
-        return alike if alike["lap_time_s"].notna().sum() >= 2 else self.episodes
+        return alike if alike["lap_time_s"].notna().any() else self.episodes
 
     def of_episodes(self, wanted: NDArray[np.bool_], *columns: str) -> pd.DataFrame:
         """Return columns of the driven rows of the wanted episodes, (n,) in the order of `episodes`."""
@@ -269,11 +271,11 @@ class LogView:
         return np.append(np.flatnonzero(np.diff(self.episode_index, prepend=-1)), len(self.steps))
 
     def fastest_lap(self, *columns: str) -> pd.DataFrame | None:
-        """Return columns of the driven rows of the fastest complete lap, None without a lap."""
-        times_s = self.episodes["lap_time_s"].to_numpy(np.float64)
-        if not np.isfinite(times_s).any():
+        """Return columns of the driven rows of the fastest `comparable` lap, None without a lap."""
+        laps_s = self.comparable["lap_time_s"].dropna()
+        if laps_s.empty:
             return None
-        return self.of_episodes(np.arange(len(times_s)) == np.nanargmin(times_s), *columns)
+        return self.of_episodes(self.episodes.index == laps_s.idxmin(), *columns)
 
     def _select(self, wanted: NDArray[np.bool_], columns: Sequence[str]) -> pd.DataFrame:
         return self._taken(np.flatnonzero(wanted), columns)
@@ -420,7 +422,7 @@ def prepare_races(recording: Recording, track: str | None = None) -> LogView:
 def once_per_view(
     find: Callable[Concatenate[LogView, Arguments], Result],
 ) -> Callable[Concatenate[LogView, Arguments], Result]:
-    """Cache the results of a function of a view, and of hashable arguments, with the view."""
+    """Memoise a function of a view and hashable arguments; the cache lives with the view."""
     results: WeakKeyDictionary[LogView, dict[Any, Result]] = WeakKeyDictionary()
 
     @wraps(find)

@@ -182,7 +182,7 @@ def _stretches(steps: pd.DataFrame) -> tuple[Values, Values, Values]:
 
 
 def _shifted(values: Values, rows: int) -> Values:
-    """Return each row's value `rows` rows earlier, 0 where there is none."""
+    """Return the values shifted down by `rows` rows, with zeros filled in at the top."""
     return values if not rows else np.concatenate([np.zeros(min(rows, len(values))), values[:-rows]])
 
 

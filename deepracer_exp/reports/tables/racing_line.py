@@ -18,7 +18,7 @@ SAMPLE_M = 0.15
 MOST = 200
 """Points of a line; the computing time grows with their cube."""
 ROUNDS = 5
-"""Each round goes half of the way to its solution, so that the line does not oscillate; five go 97 per cent."""
+"""Damped rounds: each goes half of the way to its solution, so that the line does not oscillate; five go 97 %."""
 WHEELBASE_M = 0.164
 """Wheelbase of every car of the service (deepracer-simapp urdf/deepracer)."""
 

@@ -58,9 +58,9 @@ class SlowerLaps:
 def slower_laps(iterations: pd.DataFrame) -> SlowerLaps | None:
     """Test whether laps became slower since they were fastest; None: no, or there are too few to say.
 
-    The lap times since the fastest three in a row are compared with their order (Kendall's tau, one-sided). That
-    start was chosen among all, so the chance of a false alarm is divided by their number (Bonferroni). The return
-    rose if the same test says so of the returns of the same iterations.
+    Kendall's tau (one-sided) tests the lap times since the fastest three in a row for a rising trend. That start was
+    chosen among all, so the significance level is divided by their number (Bonferroni). The return rose if its values
+    in the same iterations pass the same test.
 
     Args:
         iterations: a row each, with `iteration`, `reward_mean`, `eval_lap_share` and the columns SERIES; the first of

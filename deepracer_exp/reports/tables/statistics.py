@@ -16,7 +16,7 @@ MOST_ROWS = 100_000
 
 
 def moving_average(values: Values) -> Values:
-    """Return for each value the mean of the known ones among the last three; NaN where the value itself is NaN."""
+    """Return the trailing moving average over three values, ignoring NaN; NaN where the value itself is NaN."""
     series = pd.Series(values, dtype=np.float64)
     return series.rolling(3, min_periods=1).mean().where(series.notna()).to_numpy()
 
@@ -157,11 +157,11 @@ def wilson(hits: ArrayLike, tries: ArrayLike) -> tuple[Values, Values]:
 
 
 def chance_of_rise(values: Values) -> float:
-    """Return the chance that values in random order rise at least as much as these: Kendall's tau, one-sided.
+    """Return the p-value of a rising trend in the order of the values: Kendall's tau, one-sided.
 
-    NaN is no value; the chance is NaN where there are no two different ones. It is exact for different values, and
-    that of a normal distribution where some are equal (M. G. Kendall, Rank Correlation Methods, 1970). SciPy has this
-    test, too, but takes a second to import.
+    NaN values are left out; the p-value is NaN unless two values differ. It is exact without ties, and a normal
+    approximation with ties (M. G. Kendall, Rank Correlation Methods, 1970). SciPy has this test, too, but takes a
+    second to import.
     """
     measured = values[~np.isnan(values)]
     n, equal = len(measured), np.unique(measured, return_counts=True)[1]

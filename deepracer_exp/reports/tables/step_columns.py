@@ -36,7 +36,7 @@ DERIVED_COLUMNS: Mapping[str, str] = {
 }
 """Names of the columns that `add_derived` adds, with meaning and unit."""
 SPEED_STEPS = 5
-"""Control steps whose distances are divided by their times, two of them before and two after the step itself.
+"""Window of the speed in control steps: their distance over their time, two steps on either side of the step itself.
 
 Steps last 20 to 110 ms by the time stamps, but positions are not of those moments: of single steps up to 38% are above
 the fastest command, up to 20 m/s. By a constant period the fast recordings of version 6 would reach 16 m/s, since it

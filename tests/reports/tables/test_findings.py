@@ -17,6 +17,7 @@ from deepracer_exp.reports.charts.figure import Chart
 from deepracer_exp.reports.finding import Finding
 from deepracer_exp.reports.findings import findings as find
 from deepracer_exp.reports.pages.log_report import SECTIONS, LogPage, draw_sections, html
+from deepracer_exp.reports.tables.line_file import recorded_line
 from deepracer_exp.reports.tables.log_tables import NONE, best_laps, headline, iteration_rows
 from deepracer_exp.reports.tables.log_view import LEAST_EPISODES, LogView, once_per_view, prepare
 from deepracer_exp.reports.tables.off_track import neighbours
@@ -362,12 +363,19 @@ def test_lap_times_of_cars_that_differ_are_not_compared() -> None:
     assert "since iteration 6 on usual conditions took" in chance.sentence
     assert "100% of these episodes were complete laps" in chance.sentence
     assert of(alike, "chance").values["laps"] == 12
+    fastest_s = Drive(speed_mps=3.2).lap_time_s()
+    assert f"the fastest in {fastest_s:.2f} s" in headline(view)
+    assert best_laps(view).rows[0][0] == f"{fastest_s:.2f}"
+    assert recorded_line(view, None)[1].endswith(f"{fastest_s:.3f} s")
+    charts = {chart.name: chart for some in draw_sections(LogPage(view, [])).values() for chart in some}
+    assert f": {fastest_s:.3f} s" in charts["lap_line"].title
+    assert charts["lap_time_histogram"].rows[0][0].title == "All complete laps on usual conditions (18)"
     lost = sectors_now(view, COURSE)[1].sum(axis=1)
     assert (lost.min(), lost.max()) == pytest.approx([Drive(speed_mps=v).lap_time_s() for v in (3.2, 3.0)])
     # Episodes on other conditions count in all that does not compare lap times.
     assert len(view.now()[0]) == 12
-    few = prepare(run_of(alike, usual_episodes=usual[:1]))
-    assert len(few.comparable) == len(few.episodes) == len(drives)
+    for few, comparable in ((usual[:1], 1), (usual[:0], len(drives))):
+        assert len(prepare(run_of(alike, usual_episodes=few)).comparable) == comparable
 
 
 def test_without_a_lap_there_is_no_chance_and_few_say_little() -> None:
@@ -537,11 +545,11 @@ def test_a_car_that_became_faster_and_less_sure_is_called_so_with_what_to_do() -
     assert first.rule == "overfits"
     assert "held-out evaluations in a row fell from 100%" in first.sentence
     assert "faster meanwhile, from 7.80 to 6.00 s: it is faster and less sure" in first.sentence
-    assert "Clone it with randomization=sim2real, at a tenth of the learning rate" in first.sentence
+    assert "Clone it at a tenth of the learning rate, with randomization=sim2real" in first.sentence
     # The best, of iteration 10, is as unsure as the last one.
     assert "or take checkpoint 5, an earlier one, whose held-out evaluation completed 100%" in first.sentence
     trained_so = held_out(training([1.0] * 12), completions, [8.0] * 12, randomized=True)
-    assert "Clone it at a tenth of the learning rate" in findings(trained_so)[0].sentence
+    assert "Clone it at a tenth of the learning rate; or" in findings(trained_so)[0].sentence
 
 
 @pytest.mark.parametrize(

@@ -68,11 +68,14 @@ def test_what_ended_a_run_decides_which_step_is_the_first(runs):
     (run / "lineage.json").unlink()
     assert first["converged"] == f"deepracer-exp evaluate {run_word(run)}"
     assert [line.split()[1] for line, _ in lines["overfitting"]].count("clone") == 1
-    # What is trained on changing conditions already is not advised to be.
+    # What is trained on changing conditions alone is not advised to be.
     config = yaml.safe_load((run / "config.yaml").read_text())
-    config["randomization"]["friction_scale"] = [0.8, 1.2]
-    (run / "config.yaml").write_text(yaml.safe_dump(config))
-    assert next_steps(run, {**summary, "rule": "overfitting"})[0][0] == first["converged"]
+    for share, offered in ((0.5, True), (1.0, False)):
+        config["randomization"] |= {"friction_scale": [0.8, 1.2], "car_share": share}
+        (run / "config.yaml").write_text(yaml.safe_dump(config))
+        steps = [line for line, _ in next_steps(run, {**summary, "rule": "overfitting"})]
+        assert steps[0] == (second_phase if offered else first["converged"])
+        assert (second_phase in steps) is offered
 
 
 @pytest.mark.parametrize(

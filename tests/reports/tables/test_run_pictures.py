@@ -117,6 +117,18 @@ def test_the_fastest_complete_lap_is_drawn_in_the_speeds_at_the_ends_of_its_segm
     assert png(driven_lines(trace[list(LINE_COLUMNS)], {"circle": circle_track()})) == png(figure)
 
 
+def test_a_lap_on_usual_conditions_is_drawn_before_a_faster_one_of_a_car_that_differs() -> None:
+    trace = pd.concat(
+        [
+            drive(steps=150, status="lap_complete", car=1),
+            drive(steps=200, status="lap_complete", episode=1),
+        ]
+    )
+    for usual, lap in (([True, False], "13.33"), ([True, True], "10.00"), ([False, False], "10.00")):
+        figure = driven_lines(trace, {"circle": circle_track()}, None, np.array(usual))
+        assert words(figure)[1].startswith(f"exploring lap in {lap} s")
+
+
 def test_each_track_has_its_own_best_episode_and_one_scale_of_speed_holds_for_all() -> None:
     trace = pd.concat(
         [
