@@ -54,9 +54,10 @@ race: $(RACER)  ## train the default experiment until the car drives reliably
 	@$(BIN)/deepracer-exp train stopping=reliable
 
 # Two processes, each with a half in the order of the files, which share what a folder trains, imports and starts; the
-# first that is done takes half of what is left of the other's.
+# first that is done takes half of what is left of the other's. ORDER=N shuffles files, and the tests in them.
 test: $(STAMP)  ## the tests, without the long ones and most of those of killed processes
-	@$(BIN)/python -m pytest -q -m "not slow and not faults" -n 2 --dist worksteal --junitxml=test_times.xml
+	@$(BIN)/python -m pytest -q -m "not slow and not faults" -n 2 --dist worksteal --junitxml=test_times.xml \
+		$(if $(ORDER),--random-order-seed=$(ORDER))
 
 test-long: $(STAMP)  ## the tests that take longer than ten seconds each, and those of drawn examples with new ones
 	@$(BIN)/python -m pytest -q -m "slow or hypothesis" --hypothesis-profile=new -n 2
