@@ -1,4 +1,4 @@
-"""The account's cache of slow results between commands; anything removed is made again."""
+"""The user's on-disk cache of slow results; anything deleted is recomputed."""
 
 import contextlib
 import functools

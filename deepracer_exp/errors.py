@@ -6,9 +6,9 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 _LONGEST_LINE = 4000
-"""Characters of a message; the longest lists of options have fewer."""
+"""Longest message in characters; the longest lists of options are shorter."""
 _LONGEST_READ = 100_000
-"""Characters of a message that are processed: megabytes would take seconds."""
+"""Characters of a message beyond which it is cut before processing: megabytes would take seconds."""
 _HEAD, _TAIL = 120, 60
 _LONG_VALUE = re.compile(r"\S{400,}|(?<!\w)('|\")(?:(?!\1).){400,}\1(?!\w)")
 """A value that a message repeats: one word, or quoted. Accepted values are neither."""

@@ -1,8 +1,8 @@
-"""Numba's `njit` and `cfunc` for functions of this package, whose code is kept in a folder of its own.
+"""Numba's `njit` and `cfunc`, with an on-disk cache that is invalidated by a change of any compiled source.
 
-Numba looks at the file of a function alone when it decides whether code on disk is still that of the source. Functions
-and constants of other files are part of the code, too: after an update of the tyres alone cars would still drive on the
-old ones. Hence the name of the folder is a hash of all these files.
+Numba's own cache checks only the file that defines a function, not those whose functions and constants are compiled
+into it: after a change of the tyres alone, cars would still drive on the old ones. So the cache folder is named after a
+hash of all these files.
 """
 
 import threading

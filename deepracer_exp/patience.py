@@ -1,7 +1,7 @@
-"""Waiting for processes until they hang, however busy the machine is.
+"""Timeouts that tell a hung process from one that a busy machine slows down.
 
-A limit by the clock alone ends healthy processes: where a dozen others compete for the cores, a start of 25 s takes
-minutes. So a process is granted seconds of its CPU while it computes, and seconds of the clock only while it does not.
+A wall-clock limit alone kills healthy processes: with a dozen others competing for the cores, a start of 25 s takes
+minutes. So a process that computes is charged CPU time, and wall-clock time only while it is idle.
 """
 
 import os

@@ -19,7 +19,7 @@ _PREFIX = "deepracer_exp-"
 _SEMAPHORE = re.compile(r"sem\.mp-[a-z0-9_]{8}")
 """Name of a semaphore of Python's `multiprocessing`; TorchRL makes four for cars in several processes."""
 _LONGEST_BASE = 50
-"""Bytes of the path above: the name of a fork server's socket, 55 below it, has at most 107 (unix(7))."""
+"""Longest parent path in bytes: a fork server's socket adds 55, and its path has at most 107 (unix(7))."""
 
 
 def own_scratch() -> None:

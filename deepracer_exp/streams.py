@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from typing import Any, TextIO
 
 _CONTROLS = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-"""Characters that a terminal obeys, that turn the direction of a text, or that no stream can encode."""
+"""Control characters, bidirectional marks, and surrogates, which no stream can encode."""
 _ACCOUNT = re.compile(
     # In an ARN; and in a bucket's name: aws-deepracer-ACCOUNT, sagemaker-us-east-1-ACCOUNT, s3://ACCOUNT-logs.
     r"(?<=:)\d{12}(?=:)|((?<=[A-Za-z]-)|(?<=[a-z]-\d-)|(?<=s3://))"

@@ -270,10 +270,10 @@ class SensorNet(nn.Module):
 
 
 class Attention(nn.Module):
-    """A weighted sum of the places of a column of a picture, [n, channels, height, width] -> [n, channels, 1, width].
+    """Attention pooling over the height of a picture, [n, channels, height, width] -> [n, channels, 1, width].
 
-    The weights of a column's places sum to 1; columns stay apart, so that directions are kept. Source:
-    deepracer-simapp, `bundle/markov/presets/left_stereo_attention.py`.
+    The weights of each column sum to 1. Columns are not mixed, so that directions are kept. Source: deepracer-simapp,
+    `bundle/markov/presets/left_stereo_attention.py`.
     """
 
     def __init__(self, channels: int, units: int) -> None:

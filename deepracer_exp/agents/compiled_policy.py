@@ -51,7 +51,7 @@ class CompiledPolicy:
         return cls(policy) if fits else None
 
     def sample(self, observation: Floats, noise: NDArray[np.float64]) -> tuple[Actions, Floats]:
-        """Return an action for each row and the logarithm of its probability or density.
+        """Sample an action for each row; return it with its log-probability or log-density.
 
         Args:
             observation: [N, features].
@@ -124,7 +124,7 @@ def _layer(inputs, weights, bias, activation, outputs):  # type: ignore[no-untyp
 
 @compiled
 def _sample_commands(loc, log_std, noise, commands, log_prob):  # type: ignore[no-untyped-def]
-    """Write steering and speed, [N, 2], and the logarithms of their densities, [N]."""
+    """Write steering and speed, [N, 2], and their log-densities, [N]."""
     scale = limited_log_std(log_std)
     for row in range(len(loc)):
         for axis in range(loc.shape[1]):
@@ -134,7 +134,7 @@ def _sample_commands(loc, log_std, noise, commands, log_prob):  # type: ignore[n
 
 @compiled
 def _sample_indices(logits, noise, indices, log_prob):  # type: ignore[no-untyped-def]
-    """Write indices, [N], by the inverse of the distribution function, and the logarithms of their probabilities."""
+    """Sample indices, [N], by inverse transform, and write them with their log-probabilities."""
     for row in range(len(logits)):
         normal = log_sum(logits[row])
         # The standard normal distribution function.

@@ -1,13 +1,12 @@
-"""Convolutions of pictures on the CPU, in parts that free cores take.
+"""CPU convolutions of pictures, split into parts that idle cores pick up.
 
-The first layer sees one channel and moves on by several pixels, which the processor's products of matrices do not suit.
-Here each block of stride x stride pixels becomes as many channels, and the same weights in another order the kernel of
-a layer that moves on by one block: five times as fast in bfloat16, and equal but for rounding.
+The first layer has one input channel and a large stride, which suits matrix instructions badly. So it is computed
+space-to-depth: each block of stride x stride pixels becomes as many channels, and the rearranged weights become a
+kernel of stride 1. That is five times as fast in bfloat16, and equal up to rounding.
 
-A minibatch is convolved in parts of `PART` pictures, whose outputs stay in the processor's cache. A part is
-differentiated where it was convolved, and the gradients of parts are added in their order, so that the result is the
-same bit for bit on any number of threads. A thread that other work slows down takes fewer parts, and the others need
-not wait for it.
+A minibatch is processed in parts of `PART` pictures, whose activations stay in the processor's cache. Each part has its
+own backward pass, and gradients are summed in the order of the parts: the result is bit-identical on any number of
+threads. A thread that other work slows down takes fewer parts, and the others need not wait for it.
 """
 
 import functools

@@ -1,8 +1,8 @@
-"""The inner loop of clipped PPO for perceptrons of features, compiled.
+"""The compiled inner loop of clipped PPO, for perceptrons on features.
 
-A gradient step on some hundred steps of features is small: TorchRL, TensorDict and autograd take four times as long as
-its matrix products. Here the derivatives of `ClipPPOLoss` are formulas, and an epoch's gradient steps are one call.
-Pictures, shared trunks, and networks and losses of the user's own are differentiated by autograd, see `PPO`.
+A minibatch of a few hundred feature vectors is so small that TorchRL, TensorDict and autograd take four times as long
+as its matrix products. Here the gradient of `ClipPPOLoss` is written out by hand, and an epoch is one compiled call.
+Pictures, shared trunks, and networks and losses of the user's own go through autograd, see `PPO`.
 """
 
 import functools
@@ -28,7 +28,7 @@ Floats = NDArray[np.float32]
 NO_ACTIVATION = -1
 _ACTIVATIONS: dict[type[nn.Module], int] = {nn.ReLU: 0, nn.Tanh: 1, nn.ELU: 2, nn.SiLU: 3}
 _LEAST_LOG_STD = math.log(1e-4)
-"""Log below which the standard deviation of the library's `AddStateIndependentNormalScale` stays as it is."""
+"""Lower bound of the log standard deviation, as in the library's `AddStateIndependentNormalScale`."""
 _HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 _BETA1, _BETA2 = 0.9, 0.999
 _NO_SCALE: Floats = np.zeros(0, np.float32)
@@ -48,14 +48,14 @@ class Steps(NamedTuple):
     action: NDArray[Any]
     """[N, 2] float32, or int64 [N] of a discrete policy."""
     log_prob: Floats
-    """Logarithm of the action's probability or density when it was collected, [N]."""
+    """Log-probability or log-density of the action when it was collected, [N]."""
     advantage: Floats
     target: Floats
     """Target of the value network, [N]."""
 
 
 class Scale(NamedTuple):
-    """The logarithm of a continuous policy's standard deviation, (2,), empty of a discrete one, and its gradient."""
+    """Log standard deviation of a continuous policy, (2,), empty for a discrete one, and its gradient."""
 
     log_std: Floats
     by_log_std: Floats
@@ -308,7 +308,7 @@ def _activate(values, bias, slopes, activation):  # type: ignore[no-untyped-def]
 
 @compiled
 def activated(value, activation):  # type: ignore[no-untyped-def]
-    """Return a number after an activation, and the activation's slope there."""
+    """Return the activation of a number, and the derivative there."""
     one, zero = np.float32(1.0), np.float32(0.0)
     if activation == NO_ACTIVATION:
         slope = one
@@ -352,13 +352,13 @@ def _backward(inputs, network):  # type: ignore[no-untyped-def]
 
 @compiled
 def limited_log_std(log_std):  # type: ignore[no-untyped-def]
-    """Return the logarithms of the standard deviations, (2,), that a continuous policy draws with."""
+    """Return the log standard deviations, (2,), with which a continuous policy samples."""
     return np.maximum(log_std, np.float32(_LEAST_LOG_STD))
 
 
 @compiled
 def log_density(action, loc, log_std):  # type: ignore[no-untyped-def]
-    """Return the logarithm of a normal distribution's density at an action, all (2,)."""
+    """Return the log-density of an action under a diagonal normal distribution; arguments are (2,)."""
     density = 0.0
     for axis in range(len(loc)):
         apart = (action[axis] - loc[axis]) * math.exp(-log_std[axis])
@@ -368,7 +368,7 @@ def log_density(action, loc, log_std):  # type: ignore[no-untyped-def]
 
 @compiled
 def log_sum(logits):  # type: ignore[no-untyped-def]
-    """Return the logarithm of the sum of exponentials, by which logits become logarithms of probabilities."""
+    """Return the log-sum-exp of logits: subtracted from them, it gives log-probabilities."""
     largest = logits.max()
     total = 0.0
     for index in range(len(logits)):
@@ -378,10 +378,10 @@ def log_sum(logits):  # type: ignore[no-untyped-def]
 
 @compiled
 def _differentiate(outputs, by_outputs, action, steps, scale, loss):  # type: ignore[no-untyped-def]
-    """Differentiate the clipped loss and the entropy bonus by the policy's outputs and the logarithm of its scale.
+    """Write the gradient of the clipped loss and entropy bonus with respect to the policy's outputs and log scale.
 
-    `action` is that of the steps: an argument, whose dimensions numba knows. Returns the loss, the entropy, the share
-    of clipped ratios and the divergence.
+    `action` is that of the steps, passed separately so that numba knows its dimensions. Returns the loss, the entropy,
+    the share of clipped ratios and the KL divergence.
 
     Source of the loss: Schulman et al. 2017, arXiv 1707.06347, equation 7.
     """
@@ -439,7 +439,7 @@ def _differentiate(outputs, by_outputs, action, steps, scale, loss):  # type: ig
 
 @compiled
 def _value_loss(values, by_values, target, loss):  # type: ignore[no-untyped-def]
-    """Differentiate the loss of the values by them, and return it."""
+    """Return the value loss, and write its gradient with respect to the values."""
     count, total = len(target), 0.0
     huber, weight = loss.huber, loss.critic_coeff
     for step in range(count):

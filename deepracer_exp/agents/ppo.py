@@ -43,9 +43,9 @@ class _Loss(ClipPPOLoss):
 class PPO(Algorithm):
     """Clipped PPO.
 
-    Hyperparameters have DeepRacer's meaning: advantages standardised once over the whole batch, a constant clip range,
-    every epoch a new shuffle, a last minibatch that is not full left out. Unlike DeepRacer's trainer, episodes need not
-    be complete: an open or truncated one is continued by the value of its last observation.
+    Hyperparameters have DeepRacer's meaning: advantages are standardised once over the whole batch, the clip range is
+    constant, every epoch reshuffles, and a partial last minibatch is dropped. Unlike in DeepRacer's trainer, episodes
+    need not be complete: an open or truncated one is bootstrapped from the value of its last observation.
     """
 
     networks: ActorCritic

@@ -211,7 +211,7 @@ class SAC(Algorithm):
         return math.exp(self._loss.log_alpha.item())
 
     def _own_of_loss(self) -> dict[str, Tensor]:
-        """Return the state that only the loss holds: delayed copies and the temperature's logarithm, by name."""
+        """Return the state that only the loss holds, by name: target networks and log temperature."""
         held = [*self._loss.named_parameters(), *self._loss.named_buffers()]
         return {
             name: value
@@ -230,7 +230,7 @@ class SAC(Algorithm):
 
     @torch.no_grad()
     def _take_networks(self) -> None:
-        """Start learning from the weights of `networks`, with delayed copies of them."""
+        """Load the weights of `networks` into the learner and the target networks."""
         if self._learner is not self.networks:
             self._learner.load_state_dict(self.networks.state_dict())
         for number, critic in enumerate(self.networks.critics):

@@ -1,4 +1,4 @@
-"""Networks of soft actor-critic: a policy whose actions a hyperbolic tangent bounds, and two critics of actions."""
+"""Networks of soft actor-critic: a tanh-squashed policy and two Q-networks."""
 
 import math
 
@@ -27,7 +27,7 @@ from .actor_critic import (
 )
 
 _LOG_STD = -20.0, 2.0
-"""Bounds of a logarithm of a standard deviation, as in the service (deepracer-simapp, `heads/sac_head.py`)."""
+"""Bounds of the log standard deviation, as in the service (deepracer-simapp, `heads/sac_head.py`)."""
 
 
 class SoftActorCritic(PolicyNetworks):
@@ -53,7 +53,7 @@ class SoftActorCritic(PolicyNetworks):
 
 
 class BoundedGaussian(nn.Module):
-    """Mean and standard deviation before the hyperbolic tangent, both by the same layers, [..., 2] each."""
+    """Mean and standard deviation before the tanh, from the same layers, [..., 2] each."""
 
     def __init__(self, layers: nn.Module) -> None:
         """Wrap layers with two outputs per action: the means, then the logarithms of the deviations."""

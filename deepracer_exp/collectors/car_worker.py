@@ -225,7 +225,7 @@ class SamplingPolicy(TensorDictModuleBase):
 
 
 def _drawn(distribution: Distribution, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Return samples for standard normal numbers and their log-density, by the inverse of the distribution function."""
+    """Transform standard normal noise into samples (inverse transform); return them with their log-density."""
     if isinstance(distribution, Categorical):
         below = distribution.probs.cumsum(-1)[..., :-1]  # the last is 1, up to rounding
         action = (torch.special.ndtr(noise) >= below).sum(-1)

@@ -1,7 +1,7 @@
-"""Imported last by the fork server, and by nothing else: makes the slow first compiled call of a process.
+"""Imported last by the fork server only: makes the slow first compiled call, so that forked workers need not.
 
-numba then loads its runtime, a third of a second, which the server does while the training process imports; each worker
-would do it while the training waits.
+That call loads numba's runtime, which takes a third of a second. The server does so while the training process still
+imports; workers would do so while the training waits.
 """
 
 import gc

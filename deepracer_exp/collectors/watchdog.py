@@ -1,4 +1,4 @@
-"""Detects worker processes that die, and detects and ends those that hang."""
+"""Detects workers that die, and kills those that hang."""
 
 import contextlib
 import logging

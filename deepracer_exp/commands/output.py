@@ -1,4 +1,4 @@
-"""What commands print: consoles, warnings, and the result of a run."""
+"""Output of commands: consoles, warnings, and the result of a run."""
 
 import functools
 import logging
@@ -111,7 +111,7 @@ def print_notes(notes: Iterable[str]) -> None:
 
 
 def print_start() -> None:
-    """Say what takes the seconds before the first car drives."""
+    """Announce the wait before the first car drives, with its reason."""
     warn_of_compiling()
     what = "starting: loading PyTorch and MuJoCo"
     if is_compiled_first("tyres"):
@@ -128,14 +128,14 @@ def is_compiled_first(module: str) -> bool:
 
 @functools.cache
 def warn_of_compiling() -> None:
-    """Say once that compiled code cannot be kept, where this is so."""
+    """Warn once if compiled code cannot be cached."""
     if compiled_folder() is None:
         why = "NUMBA_CACHE_DIR, XDG_CACHE_HOME or HOME names no folder that can be written"
         print(f"warning: each command compiles the physics again, for about 20 s: {why}", file=sys.stderr)
 
 
 def print_result(outcome: "TrainResult", tracking: "TrackingConfig") -> None:
-    """Print how a run ended, where its results are, and what to do next."""
+    """Print a run's ending, the place of its results, and next steps."""
     from deepracer_exp.config.running import MLflowTracking
     from deepracer_exp.runs.next_steps import COMMAND, next_steps, open_report
     from deepracer_exp.runs.run_result import result_of
@@ -186,7 +186,7 @@ def _reliable_lap(run: Path) -> str:
 
 
 def print_steps(steps: Sequence[tuple[str, str]]) -> None:
-    """Print commands, each with what it does: beside it, or above it where the terminal is too narrow for that."""
+    """Print commands with their purposes: beside them, or above them on a narrow terminal."""
     if not steps:
         return
     print("\n  next")
@@ -199,7 +199,7 @@ def print_steps(steps: Sequence[tuple[str, str]]) -> None:
 
 
 def print_results(outcomes: "Sequence[TrainResult]", tracking: "TrackingConfig") -> None:
-    """Print one line per run, and what groups of runs that differ only in their seed and track scored."""
+    """Print one line per run, and the scores of groups of runs that differ only in seed and track."""
     print(f"\n{count(len(outcomes), 'run')}:")
     for outcome in outcomes:
         print(f"  {full_name(outcome.folder)}  {outcome.status}  {_lap(outcome)}  {outcome.reason}")
@@ -229,7 +229,7 @@ def _print_groups(runs: "Sequence[Path]") -> None:
 
 
 def _print_unrecorded(outcomes: "Sequence[TrainResult]", tracking: "TrackingConfig") -> None:
-    """Say last, on standard error, what was not recorded, and how to send it later."""
+    """Report last, on standard error, the missing records and the command that sends them."""
     from deepracer_exp.config.running import MLflowTracking
     from deepracer_exp.runs.next_steps import own_word
 
@@ -246,7 +246,7 @@ def _print_unrecorded(outcomes: "Sequence[TrainResult]", tracking: "TrackingConf
 
 
 def print_unsent(study: "Path") -> None:
-    """Say on standard error of how many runs of a study MLflow lacks something, and how to send it later."""
+    """Report on standard error how many runs of a study are incomplete in MLflow, and the command that sends them."""
     from deepracer_exp.runs.run_files import CONFIG
     from deepracer_exp.tracking.delivery import undelivered
     from deepracer_exp.tracking.store import resolve_store
@@ -267,7 +267,7 @@ def print_unsent(study: "Path") -> None:
 
 
 def store_word(runs_dir: "Path", uri: str | None) -> str:
-    """Return the word of a command line that says where runs are recorded; empty for the usual place."""
+    """Return the override for the place where runs are recorded; empty for the default."""
     store = f"runs_dir={runs_dir}" if uri is None else f"tracking.uri={uri}"
     return "" if store == "runs_dir=runs" else f" {shlex.quote(store)}"
 
@@ -278,7 +278,7 @@ def _command() -> str:
 
 
 def _lap(outcome: "TrainResult") -> str:
-    """Return the fastest reliable lap of a run's evaluated policies, or what exploration did if there is none."""
+    """Return the fastest reliable lap of a run's evaluated policies, or else a summary of the exploring laps."""
     # A run that failed in its first iteration has no metrics.
     file = outcome.folder / METRICS
     lap = fastest_reliable(read_metrics(file)) if file.is_file() else None
@@ -289,5 +289,5 @@ def _laps(summary: Mapping[str, Any]) -> str:
     tracks = summary.get("tracks")
     if tracks is not None:
         return f"laps on {sum(track['laps'] > 0 for track in tracks.values())} of {len(tracks)} tracks"
-    best = summary["best_lap_time_s"]
-    return f"{count(summary['laps'], 'lap')}, the fastest in {best:.2f} s" if best is not None else "no lap"
+    best, laps = summary["best_lap_time_s"], count(summary["laps"], "lap") if summary["laps"] else "no lap"
+    return laps if best is None else f"{laps}, the fastest in {best:.2f} s"

@@ -53,7 +53,7 @@ All of them accept runs_dir=DIR (default: runs) and tracking.uri=URI (default: t
 """
 _CLEAN_EPILOG = """\
 What can be removed:
-  - checkpoints that are neither best nor last
+  - checkpoints that are neither best, last nor the fastest reliable one
   - the traces of failed runs
   - the folders of runs that were deleted in MLflow
   - with --traces, the traces of finished runs, or all but the newest tenth of their iterations; analyze, report and
@@ -182,7 +182,7 @@ def _lineage(args: argparse.Namespace) -> int:
 
 
 def _label(member: "FamilyMember", run: Path, best: dict[int, str]) -> "Text":
-    """Return lines on a run: its name, where it comes from, what it achieved, and what it changed."""
+    """Return lines on a run: its name, origin, result, and changed values."""
     from rich.text import Text
 
     from deepracer_exp.reports.tables.comparison import value_text

@@ -1,8 +1,8 @@
 """Acting values: those that run code or a program, or decide where data is sent.
 
-A command takes over only these from a stored run, study or trial: those that its user names now, on the command line,
-in an option file or in a script, and those that a run or study of this account has used before. Code is identified by
-its contents, everything else by its text. docs/security.md explains it to users.
+From a stored run, study or trial, a command accepts an acting value only if its user names it now (on the command line,
+in an option file or in a script), or if a run or study of this account has used it before. Code is identified by its
+contents, everything else by its text. The user's view: docs/security.md.
 """
 
 import contextlib

@@ -1,4 +1,4 @@
-"""Override expressions to a validated experiment."""
+"""Composes override expressions into a validated experiment."""
 
 import difflib
 import itertools

@@ -1,7 +1,7 @@
-"""Option files composed by Hydra: the only place that runs it, through its public plugins and `hydra.compose`.
+"""Composes option files: the only module that runs Hydra, through its public plugins and `hydra.compose`.
 
-Hydra has no public way to compose from folders with a reader of our own alone: `initialize_config_dir` wants a folder
-that it reads itself. It gets the folder of this module, in which it finds no option, and our plugin adds the real ones.
+Hydra's public API cannot compose with a custom reader alone: `initialize_config_dir` requires a folder that Hydra reads
+itself. It gets the folder of this module, which holds no options, and our plugin adds the real ones.
 """
 
 import copy
@@ -77,8 +77,8 @@ def _parsed(text: str) -> DictConfig:
 class OptionFiles(ConfigSource):
     """Reads a folder of option files for Hydra: only files below it, with the checks of every user file.
 
-    It has the worlds, too: all that is in Hydra's `ConfigStore` is copied at each composition, and 120 worlds there
-    were a fifth of the work.
+    It serves the worlds, too: Hydra copies its whole `ConfigStore` at each composition, and 120 worlds there took a
+    fifth of the time.
     """
 
     @staticmethod
@@ -229,7 +229,7 @@ def change(config: DictConfig, override: Override) -> bool:
 
 
 def plain(value: Any) -> Any:
-    """Return values as plain Python: text for all keys, and for values that JSON does not have.
+    """Return values as plain Python; keys, and values without a JSON type, become text.
 
     Raises:
         OmegaConfBaseException: an interpolation leads nowhere, or a value is missing.

@@ -1,4 +1,4 @@
-"""Plain values to validated, frozen dataclasses; bad values are reported by their dotted keys."""
+"""Parses plain values into validated, frozen dataclasses; errors name the dotted key."""
 
 import json
 import math

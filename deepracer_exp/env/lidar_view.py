@@ -22,9 +22,9 @@ from deepracer_exp.sim.scenery import wall_ring
 from deepracer_exp.tracks.track import Track
 
 _NOISE_NUMBERS = 2**16
-"""Standard normal numbers that all scans take their noise from: drawing new ones would take longer than the scan."""
+"""Standard normal numbers that all scans share as noise: drawing new ones would take longer than the scan."""
 _NEXT_SCAN = 7919
-"""Offset between the noise of successive scans, in these numbers."""
+"""Offset among these numbers from one scan to the next."""
 
 Readings = NDArray[np.float32]
 

@@ -77,7 +77,7 @@ class Measures:
 
     @classmethod
     def example(cls, n_cars: int) -> "Measures":
-        """Return measures that fit together in shape only, all 1."""
+        """Return dummy measures, all 1, with consistent shapes."""
         return cls(
             **{
                 field.name: np.ones((n_cars, 2) if field.name in _PAIRS else n_cars, _TYPES.get(field.name))

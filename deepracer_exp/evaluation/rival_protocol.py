@@ -77,5 +77,5 @@ def _or_never(time_s: float | None) -> float:
 
 
 def _compare(mine: float, theirs: float) -> float:
-    """Return the result of a race for the larger number."""
+    """Return the result of a race that the larger number wins, from the view of `mine`."""
     return DRAWN if mine == theirs else WON if mine > theirs else LOST

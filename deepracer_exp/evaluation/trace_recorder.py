@@ -71,7 +71,7 @@ def pauses_left_s(
     penalty_s: Mapping[str, float],
     period_s: float,
 ) -> NDArray[np.float64]:
-    """Return the seconds of a penalty that are left at each row: 0 where the car serves none, (n,).
+    """Return the remaining seconds of the penalty at each row, (n,); 0 where the car serves none.
 
     The row in which a car has left the road or crashed has the whole penalty, as on the service, and the rows in which
     it is held have what is left of it.

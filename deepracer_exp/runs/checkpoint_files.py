@@ -75,12 +75,12 @@ def restore_links(folder: Path) -> None:
 
 
 def checkpoint_words(name: str) -> str:
-    """Return what people call the checkpoint in a folder of this name: ``checkpoint 8`` for ``000008``."""
+    """Return the display name of the checkpoint in a folder of this name: ``checkpoint 8`` for ``000008``."""
     return f"checkpoint {checkpoint_number(name)}"
 
 
 def checkpoint_number(name: str) -> str:
-    """Return what `checkpoint=` takes for the folder of this name: ``8`` for ``000008``, ``best`` for ``best``."""
+    """Return the value of `checkpoint=` for a folder of this name: ``8`` for ``000008``, ``best`` for ``best``."""
     return str(int(name)) if name.isdecimal() else name
 
 

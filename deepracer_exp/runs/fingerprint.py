@@ -1,4 +1,4 @@
-"""Fingerprint of a run: its configuration and files, so that no others are used to resume it."""
+"""Fingerprint of a run's configuration and files; a resume with others is refused."""
 
 import hashlib
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""The folder of a run in training: its lock, its log, its files, and what it leaves of a crash."""
+"""The folder of a run in training: lock, log, files, and crash dumps."""
 
 import contextlib
 import datetime

@@ -91,10 +91,10 @@ def _so_far(folder: Path) -> dict[str, Any]:
 
 
 def fold_studies(rows: Sequence[Row], best_runs: Mapping[str, str]) -> list[Row]:
-    """Return the rows with one for all runs of each study, where the first of them was.
+    """Collapse the runs of each study into a single row, in the place of the first.
 
-    It has the figures of the study's best run: that of `best_runs`, by the name of the study, or else the run with the
-    best race score.
+    The row has the figures of the study's best run: the one in `best_runs` under the study's name, or else the one with
+    the best race score.
     """
     studies = {row["study"] for row in rows if row["study"] is not None}
     members: dict[str, list[Row]] = {study: [] for study in studies}

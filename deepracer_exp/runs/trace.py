@@ -1,4 +1,4 @@
-"""The files of a run's trace: the steps of some iterations in each, Parquet."""
+"""The Parquet files of a run's trace, each with the steps of consecutive iterations."""
 
 import contextlib
 import json
@@ -37,11 +37,11 @@ DECIMALS = {
     **dict.fromkeys(("steer", "throttle", "pause_duration"), 2),
     **{"progress": 6, "tstamp": 6, "speed_mps": 3},
 }
-"""Decimals that are kept: those of the service's log lines, and more of progress and time, whose differences are
-used. Rounded, a row takes 16 bytes instead of 63."""
+"""Decimals kept: those of the service's log lines, with more for progress and time, which are differenced. Rounding
+shrinks a row from 63 bytes to 16."""
 MOST_ROWS = 2**17
-"""Steps after which a file is complete, if no checkpoint is written before: as many as fit into memory without notice,
-and enough that the description of its columns takes no share of it."""
+"""Steps after which a file is complete, if no checkpoint comes first: few enough to buffer in memory, and enough that
+Parquet's metadata is negligible."""
 # A level at which zstd packs the bytes of a column by their rank: 1.5 bytes less a row than the usual one.
 _LEVELS = dict.fromkeys(("X", "Y", "yaw", "steer", "throttle", "progress", "speed_mps", "tstamp"), 11)
 _LEVELS |= {"reward": 4, "closest_waypoint": 4}

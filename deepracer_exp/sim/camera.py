@@ -1,6 +1,6 @@
-"""The pictures of all cars' cameras at once: the road and its surroundings, and boxes over them.
+"""Renders the pictures of all cars' cameras at once: the road and its surroundings, with boxes over them.
 
-Straight edges of the scenery are straight in the picture, which is summed up from them column by column (`edges`).
+A pinhole camera maps straight edges to straight edges, which are rasterised column by column (`edges`).
 """
 
 from typing import NamedTuple

@@ -1,6 +1,6 @@
-"""Boxes in the pictures of cars' cameras, the farthest first.
+"""Boxes in the cameras' pictures, drawn back to front (painter's algorithm).
 
-The visible faces of one are added up as the scenery is (`edges`), with the share that they cover as one more channel.
+The visible faces of a box are rasterised like the scenery (`edges`), with their coverage as an extra channel.
 """
 
 from typing import NamedTuple

@@ -1,9 +1,8 @@
-"""Straight edges in a picture, exact to the share of each pixel that lies below them.
+"""Anti-aliased rasterisation of straight edges, by exact coverage of each pixel.
 
-Where an edge crosses a column, the colour below differs from the one above by a known amount: the sum of these changes
-from the top of the column down is the picture. A change within a pixel counts by the area below the edge, so that each
-pixel is the mean of what it sees (as glyph rasterisers do, R. Levien, "Inside the fastest font renderer in the world",
-2016).
+An edge adds its change of colour to the pixels that it crosses, weighted by the share of the pixel below it; the
+running sum down each column is the picture, in which each pixel is the mean of what it sees. Glyph rasterisers do the
+same (R. Levien, "Inside the fastest font renderer in the world", 2016).
 """
 
 import numpy as np

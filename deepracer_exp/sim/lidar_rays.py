@@ -1,4 +1,4 @@
-"""The LIDAR of all cars at once: distances to walls and boxes, whose sides are segments from above."""
+"""The LIDAR of all cars at once: rays cast in the plane against the segments of walls and of the boxes' sides."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,7 +1,7 @@
-"""One car driven by a list of commands, and the derivatives of its motion: `CarBatch`, compiled for optimisation.
+"""Compiled rollouts of one car and their derivatives: the physics of `CarBatch`, for optimisation.
 
-The forces are those of `tyres`; here they are integrated without MuJoCo, whose step costs five times as much as the
-forces. The steps are MuJoCo's: semi-implicit Euler.
+The forces are those of `tyres`. They are integrated as MuJoCo does (semi-implicit Euler), but without its step, which
+costs five times as much as the forces.
 """
 
 import numpy as np
@@ -21,7 +21,7 @@ STATE = (
 )
 """A car's state: MuJoCo's position and velocity of the centre of mass, and its `DRIVE` record; SI units."""
 _NUDGE = np.array([1e-5, 1e-5, 1e-5, 1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4])
-"""Differences with which derivatives by the state are formed."""
+"""Step sizes of the finite differences, by entry of the state."""
 _NUDGE_COMMAND = np.array([1e-4, 1e-5])
 
 

@@ -17,8 +17,7 @@ Value = TypeVar("Value")
 CALL_S = 120.0
 """Longest wait for one call, which may send a checkpoint.
 
-The time limit of an HTTP request is one for the pause between two bytes: a server that sends one now and then would
-hold it for ever."""
+An HTTP timeout only limits the pause between two bytes: a server that trickles them could hold a call for ever."""
 LISTING_S = 300.0
 """Longest wait for all pages of a listing together: a server could give one a minute for ever."""
 _SAY_AFTER_S = 10.0
@@ -54,7 +53,7 @@ class BoundedClient:
 
 
 def ended_within(seconds: float, call: Callable[[], Value]) -> Value:
-    """Return the result of a call; its thread is left alone when time is up, since nothing can end it.
+    """Return the result of a call; when time is up, its thread is abandoned, since a thread cannot be killed.
 
     While this process or one that it has started computes, its CPU time is what counts (`wait_patiently`).
 

@@ -1,6 +1,6 @@
 """Download a registered checkpoint and its run's files from MLflow, for a run without a folder here.
 
-A separate process does it: it can be ended whatever it waits for, and the kernel limits its writes.
+It runs in a separate process, which can be killed whatever it waits for, and whose writes the kernel limits.
 """
 
 import json

@@ -72,8 +72,8 @@ class RunProjection:
     def update(self) -> str | None:
         """Record everything missing in the tracker; return the first refusal and its reason.
 
-        This may be done at any time and again after any failure, by one process at a time. The file of its kind has
-        the outcome from then on (`Recorded`).
+        Safe at any time and after any failure, by one process at a time. The outcome is stored in the file of the
+        tracker's kind (`Recorded`).
 
         Raises:
             StoreUnavailableError: the tracker's server does not answer.

@@ -1,4 +1,4 @@
-"""The owner's side of the process that records runs (`project`): names folders to it, and waits for its answer."""
+"""The client of the process that records runs (`project`): sends it folders, and waits for its answer."""
 
 import contextlib
 import json

@@ -239,7 +239,7 @@ def silence_mlflow() -> None:
 
 
 def client_of(store: Store) -> "MlflowClient":
-    """Return a client of a store, whose calls all end.
+    """Return a client of a store, with a time limit on every call.
 
     All clients use the user and password of the latest one's store.
 

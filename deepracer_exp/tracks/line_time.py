@@ -1,8 +1,8 @@
-"""A lower bound of the lap time on a course: a line, and the speed a car can have on it.
+"""A lower bound of the lap time on a course: the fastest line of a car that uses all its limits at once.
 
-The limits of a car are an `Ability`: the speed it keeps at a curvature, and how fast it gains and loses speed on a
-straight. A real car has to steer into a bend and cannot use all limits at once, so it takes longer on the same line.
-The line is the fastest one that a local search finds; that no other line is faster is not proved.
+An `Ability` holds these limits: the highest speed at each curvature, and acceleration and braking on a straight. A real
+car has to steer into a bend and cannot use them all at once, so it takes longer on the same line. The line comes from a
+local search; that no other line is faster is not proved.
 """
 
 from typing import NamedTuple
@@ -137,7 +137,7 @@ class _Road:
         from scipy.sparse import block_diag, csr_array, diags_array, vstack
 
         def both(matrix: csr_array) -> csr_array:
-            """Return a matrix that does the same to x and y."""
+            """Return the block-diagonal matrix that applies this one to x and to y."""
             return block_diag([matrix, matrix]).tocsr()
 
         middle, half = self._middle, self._half

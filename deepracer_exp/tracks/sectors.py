@@ -67,7 +67,7 @@ def sectors_of(course: Track) -> list[Sector]:
 
 
 def sector_at(sectors: Sequence[Sector], lap_position: Values) -> NDArray[np.intp]:
-    """Return in which sector places lie, -1 where they are not known."""
+    """Return the index of the sector of each place; -1 where the place is unknown."""
     index = np.searchsorted([part.end for part in sectors[:-1]], lap_position, side="right")
     return np.where(np.isfinite(lap_position), index, -1)
 

@@ -1,4 +1,4 @@
 """Trainings: `plan.plan_training` and `run.run_training`; `trainer.Trainer` repeats its five phases.
 
-`trainer.Callback` is the way in for everything that happens beside them.
+`trainer.Callback` is the hook for everything else.
 """

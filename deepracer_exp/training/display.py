@@ -27,7 +27,7 @@ SPARKS = "▁▂▃▄▅▆▇█"
 REFRESH_S = 0.2
 """Shortest time between two drawings: more often only costs the training time."""
 _MOVE_S = 5.0
-"""Time after which the view is drawn again, with the time that has passed, however long an iteration takes."""
+"""Longest time between two drawings, so that the elapsed time advances during a long iteration."""
 LINE_S = 5.0
 """Shortest time between two plain lines; from two minutes on it grows with the run, up to `_LINE_AT_MOST_S`."""
 _LINE_AT_MOST_S = 60.0
@@ -37,7 +37,7 @@ _AT_MOST = "at most "
 LINE_COLUMNS = 120
 """Columns that no plain line exceeds."""
 _DISPENSABLE = ("entropy", "return", "completion")
-"""What a plain line leaves out, first to last, where figures are so long that it exceeds its columns."""
+"""Figures dropped from a plain line that would be too long, in this order."""
 NOTHING = "\N{EN DASH}"
 
 _HALVES = 60  # columns from which the figures stand in two halves side by side

@@ -18,7 +18,7 @@ _OTHER_BYTES = 14
 
 
 def memory_needed(experiment: Experiment) -> list[str]:
-    """Return a line for each thing that takes much memory.
+    """Return a line for each large use of memory.
 
     Raises:
         BadInput: it takes more than is free.

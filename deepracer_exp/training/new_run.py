@@ -1,4 +1,4 @@
-"""A new run: its reward function tried, its folder, and what it is recorded as."""
+"""Set-up of a new run: a test call of its reward function, its folder, and its name and tags."""
 
 import json
 import logging

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM, acted on at the end of an iteration, or without it if it takes long."""
+"""Ctrl-C and SIGTERM: they end a run after the iteration in progress, or abandon that if it takes long."""
 
 import signal
 import threading

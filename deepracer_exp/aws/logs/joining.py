@@ -1,4 +1,4 @@
-"""Joins the steps of all files of a recording: rows in both a CSV and a log, in copies or twice count once."""
+"""Joins and deduplicates the steps of all files of a recording: CSVs, logs, and copies of them."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace

@@ -52,7 +52,7 @@ _READ = {*COMMON, *LATER, _COUNTER_OR_CLOCK}
 _HEADER = re.compile(rb'[" ]*episode')
 _BEFORE_HEADER = re.compile(rb'\n(?=[" ]*episode)')
 MOST_REFUSED = 1000
-"""Lines without a row at the beginning of a file after which the rest is not read: that would take minutes."""
+"""Leading lines without a row after which a file is given up: reading the rest would take minutes."""
 MOST_STEPS = 4_000_000
 """Control steps of a recording that are held in memory: 74 hours of driving at 15 a second. A report of so many takes
 about 2.5 GB."""

@@ -6,7 +6,7 @@ VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
 
 
 def varint(value: int) -> bytes:
-    """Return a whole number, negative ones in two's complement of 64 bits."""
+    """Encode an integer as a varint; negative ones in 64-bit two's complement."""
     value &= 2**64 - 1
     out = bytearray()
     while value > 127:
@@ -16,7 +16,7 @@ def varint(value: int) -> bytes:
 
 
 def field(number: int, value: int | str | bytes) -> bytes:
-    """Return a field of a message: a number, or a text, bytes or a message with their length."""
+    """Encode a field of a message: an integer as a varint; a text, bytes or a message as length-delimited."""
     if isinstance(value, int):
         return varint(number << 3 | VARINT) + varint(value)
     raw = value.encode() if isinstance(value, str) else value
@@ -24,7 +24,7 @@ def field(number: int, value: int | str | bytes) -> bytes:
 
 
 def read_varint(raw: memoryview, position: int) -> tuple[int, int]:
-    """Return the number at a place, and the place after it.
+    """Decode the varint at a position; return it, and the position after it.
 
     Raises:
         ValueError: there is none.

@@ -163,7 +163,7 @@ def _checked_block(raw: memoryview, offset: int, size: int) -> memoryview:
 
 
 def _rows(block: memoryview) -> Iterator[tuple[bytes, memoryview]]:
-    """Yield keys and values; each key is stored without the beginning that it shares with the one before."""
+    """Yield keys and values; keys are stored prefix-compressed against the one before."""
     (restarts,) = struct.unpack_from("<I", block, len(block) - 4)
     end = len(block) - 4 * (restarts + 1)
     key, position = b"", 0

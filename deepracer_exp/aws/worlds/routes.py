@@ -228,7 +228,7 @@ def rows_from_knots(knots: ArrayLike, width_m: ArrayLike, closed: bool) -> np.nd
 
 
 def _unfold(border: np.ndarray, longest_m: float, closed: bool) -> np.ndarray:
-    """Return a border whose folds are pulled together into the point where they cross.
+    """Return a border without self-intersections: each fold is collapsed into its crossing.
 
     A border on the inside of a bend tighter than half the road's width runs backwards for a while and crosses itself;
     the area between the two passages of the crossing is road.

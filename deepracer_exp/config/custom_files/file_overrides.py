@@ -1,4 +1,4 @@
-"""The overrides that the files of a DeepRacer model and of deepracer-for-cloud stand for (`custom_files=DIR`)."""
+"""Translates the files of a DeepRacer model and of deepracer-for-cloud into overrides (`custom_files=DIR`)."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -27,7 +27,7 @@ class FileOverrides:
 
 
 def with_custom_files(overrides: Sequence[str]) -> FileOverrides:
-    """Replace `custom_files=DIR` by the overrides that the files of the folder stand for; the last one counts.
+    """Replace `custom_files=DIR` by the overrides from the files of the folder; the last of several counts.
 
     Every other override has priority over the files.
 

@@ -1,4 +1,4 @@
-"""The overrides that run.env, or the training_params.yaml of a trained model, stands for."""
+"""Translates run.env, or the training_params.yaml of a trained model, into overrides."""
 
 import re
 from collections.abc import Iterator, Mapping

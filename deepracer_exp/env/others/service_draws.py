@@ -25,7 +25,7 @@ def _hash(seed, number):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def uniform(seed, number):  # type: ignore[no-untyped-def]
-    """Return the number from 0 to 1, without 1, that a seed has at a number from 0."""
+    """Return the uniform random number in [0, 1) at position `number`, from 0, of a seed's sequence."""
     return np.float64(_hash(seed, number) >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 

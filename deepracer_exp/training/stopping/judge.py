@@ -1,4 +1,4 @@
-"""The decision of a stopping rule on a whole training, for its report.
+"""Stopping rules applied to a whole training in retrospect, for its report.
 
 A run of ours is judged by the values of its own rule, the logs of others by `LOG_RULE` and `LOG_OVERFITTING`.
 """

@@ -1,11 +1,11 @@
-"""Trends over the rows of a run: moving averages, and the parts of `stopping=entropy`, which read them."""
+"""Moving averages over the rows of a run, and the rules of `stopping=entropy` built on them."""
 
 import math
 
 from deepracer_exp.config.stopping import CollapsedRule, LapsSlowerRule, NotLearningRule, OverfittingRule
 
 Reason = tuple[str, dict[str, float]]
-"""Why a rule applies, in words, and what it compared."""
+"""The reason why a rule applies, in words, and the values that it compared."""
 
 
 class Average:
