@@ -295,3 +295,13 @@ def test_paths_are_searched_as_they_are_typed():
     assert isinstance(what, Choices)
     lines = [as_override("reward.file", value) for value in what.values]
     assert [override_value(line) for line in lines] == ["mein Lohn.py", "größer (2).py"]
+
+
+def test_another_clone_takes_the_place_of_the_whole_one_before():
+    season = ("sweep=season", "track=Oval_track")
+    for words, found in (
+        (("sweep.clone={algorithm.lr: 1e-5}",), {"algorithm.lr": 1e-5}),
+        (("sweep.clone={seed: 3, budget.iterations: 2}", "sweep.clone={seed: 4}"), {"seed": 4}),
+        (("sweep.clone=null",), None),
+    ):
+        assert compose_sweep([*season, *words]).entry.sweep.clone == found
