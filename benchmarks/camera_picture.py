@@ -1,4 +1,4 @@
-"""The picture of docs/camera.md: tracks as the camera sees them, and episodes that differ by randomization.
+"""The pictures of docs/camera.md and docs/randomization.md: tracks as the camera sees them, and differing episodes.
 
 python -m benchmarks.camera_picture
 """
@@ -14,7 +14,7 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.setup import build_setup
 
-OUTPUT = Path(__file__).parents[1] / "docs" / "images" / "camera.png"
+OUTPUT = Path(__file__).parents[1] / "docs" / "images"
 TRACKS = (
     "2022_summit_speedway",
     "reinvent_base",
@@ -31,18 +31,17 @@ GAP = 4
 
 
 def main() -> None:
-    """Write the picture."""
+    """Write the pictures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--output", type=Path, default=OUTPUT)
-    output = parser.parse_args().output
+    parser.add_argument("--output", type=Path, default=OUTPUT, help="their folder")
+    folder = parser.parse_args().output
     # The first car is a little before the start line.
-    begin = "episode.start_offset=0.965"
-    tracks = look(f"track=[{','.join(TRACKS)}]", begin)
-    episodes = look("randomization=sim2real")
-    rows = [beside(pictures) for pictures in (tracks[:4], tracks[4:], episodes[:4], episodes[4:])]
-    width = rows[0].shape[1]
-    Image.fromarray(np.vstack(rows)[GAP:, GAP:]).quantize(128).save(output, optimize=True)
-    print(f"{output}: {width} pixels wide, {output.stat().st_size / 1e3:.0f} kB")
+    tracks = look(f"track=[{','.join(TRACKS)}]", "episode.start_offset=0.965")
+    for name, pictures in (("camera", tracks), ("randomization", look("randomization=sim2real"))):
+        rows = [beside(pictures[:4]), beside(pictures[4:])]
+        file = folder / f"{name}.png"
+        Image.fromarray(np.vstack(rows)[GAP:, GAP:]).quantize(128).save(file, optimize=True)
+        print(f"{file}: {file.stat().st_size / 1e3:.0f} kB")
 
 
 def look(*overrides: str) -> NDArray[np.uint8]:

@@ -31,7 +31,7 @@ def keeps_state(source: RewardSource) -> bool:
     """Return whether a function that a training calls assigns to a variable of its module, or into one."""
     module = ast.parse(source.text)
     functions = {node.name: node for node in module.body if isinstance(node, ast.FunctionDef)}
-    called = [name for name in ("reward_batch", "reward_function") if name in functions][:1]
+    called = [name for name in sorted(functions) if name in ("reward_batch", "reward_function")][:1]
     for name in called:  # and those that they name
         named = {node.id for node in ast.walk(functions[name]) if isinstance(node, ast.Name)}
         called += sorted(named & functions.keys() - {*called})
