@@ -1,5 +1,4 @@
 import multiprocessing
-import os
 import signal
 
 import pytest
@@ -10,7 +9,7 @@ from deepracer_exp.collectors.forking import start_workers_early
 def test_ctrl_c_while_the_workers_server_starts_is_not_lost(monkeypatch):
     before = multiprocessing.get_start_method(allow_none=True)
     monkeypatch.setattr(
-        "multiprocessing.forkserver.ensure_running", lambda: os.kill(os.getpid(), signal.SIGINT)
+        "multiprocessing.forkserver.ensure_running", lambda: signal.raise_signal(signal.SIGINT)
     )
     try:
         with pytest.raises(KeyboardInterrupt):
