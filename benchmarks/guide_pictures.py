@@ -32,10 +32,11 @@ from .report import with_exit_code
 
 OUTPUT = Path(__file__).parents[1] / "docs" / "images"
 WIDTH, SCREEN = 1120, 640
-"""Of the browser's window, and height of what a first screen shows, px."""
+"""Width of the browser window, and height of a first screen, px."""
 TALLEST = 2400
+"""Height of the browser window, px."""
 COLUMNS = 100
-"""Of the terminal."""
+"""Width of the terminal."""
 _REDRAWN = re.compile(r"(?:\r|\x1b\[2K|\x1b\[1A)+\x1b\[2K")
 TRACK = "reInvent2019_track"
 SWEEP = ("sweep=lr_entropy", "sweep.trials=24", "study=pictures")
@@ -76,7 +77,7 @@ class Studio:
         self._tab.wait_for(
             "[...document.querySelectorAll('[data-plot]')].every((box) => box.querySelector('svg'))"
         )
-        # Alone, it lies within the window, beyond which a picture would be laid out anew.
+        # Alone, it fits the window: a screenshot beyond it would change the layout.
         self._tab.evaluate(f"document.body.replaceChildren(document.querySelector({json.dumps(selector)}))")
         return Image.open(self._tab.picture(self.folder / "shot.png", selector)).convert("RGB")
 

@@ -213,16 +213,12 @@ def composed_option(group: str, option: str) -> DictConfig:
     return values
 
 
-_WHOLE = {"sweep.clone"}
-"""Mappings of overrides: another one takes the place of all that was there."""
-
-
 def change(config: DictConfig, override: Override) -> bool:
     """Set or remove the value that an override names; return False if there is no such key."""
     key = override.key_or_group
     try:
         if not override.is_delete():
-            merge = key not in _WHOLE
+            merge = key != "sweep.clone"  # overrides, which another mapping of them replaces
             OmegaConf.update(config, key, override.value(), merge=merge, force_add=may_be_new(override))
             return True
         above, _, leaf = key.rpartition(".")

@@ -66,7 +66,7 @@ class DeepRacerEnv(gym.Env[Observed, Any]):
         self.render_mode = _checked(render_mode)
         setup = refuse_rivals(_composed(track, overrides), _KIND)
         self._race = Race(setup, 1)
-        self._weights = [course.weight for course in setup.courses]
+        self._weights = setup.weights
         self._courses = deal(self._weights)
         self.observation_space, self.action_space = _spaces(self._race)
         self._view = TopView(self._race)

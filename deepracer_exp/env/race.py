@@ -104,8 +104,7 @@ class Race:
             setup.observation, self.rules.tracks, steering_max_deg, high[1], setup.observation_parts
         )
         numbers = self.cars.tolist()
-        weights = [course.weight for course in setup.courses]
-        places = places_of_cars(weights, first_car + n_cars)[first_car:].tolist()
+        places = places_of_cars(setup.weights, first_car + n_cars)[first_car:].tolist()
         randomizations = of_each_car(randomizations or [setup.randomization] * n_cars, places)
         of_car = [randomization.real_car for randomization in randomizations]
         fixed = setup.real_car

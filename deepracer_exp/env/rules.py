@@ -170,8 +170,7 @@ class RaceRules:
         self.track_params = tuple(map(TrackParams.of, tracks))
         turns = np.array([len(course.tracks) for course in setup.courses])
         first_track = np.cumsum(turns) - turns
-        weights = [course.weight for course in setup.courses]
-        self.course = courses_of_cars(weights, first_car + n_cars)[first_car:]
+        self.course = courses_of_cars(setup.weights, first_car + n_cars)[first_car:]
         self.track_index = first_track[self.course]
         self._driven = np.zeros((n_cars, len(turns)), np.int64)
         self._period_s = setup.car.control_period_s

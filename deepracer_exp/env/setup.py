@@ -123,6 +123,11 @@ class RaceSetup:
     """Control steps that steering and speed commands take beyond the drawn delay, for every car."""
 
     @property
+    def weights(self) -> list[float]:
+        """Return the weight of each course in the distribution of cars."""
+        return [course.weight for course in self.courses]
+
+    @property
     def track(self) -> Track:
         """Return the first course's track in the direction of its first episode."""
         return self.courses[0].tracks[0]

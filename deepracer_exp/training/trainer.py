@@ -144,11 +144,7 @@ class Trainer:
             collector.cars,
             experiment.car.control_period_s,
             experiment.stopping,
-            usual_cars(
-                [course.weight for course in setup.courses],
-                experiment.randomization.car_share,
-                collector.cars,
-            ),
+            usual_cars(setup.weights, experiment.randomization.car_share, collector.cars),
         )
         self._trace = trace_writer(folder.path / TRACE, experiment.trace)
         # More threads do not speed up networks of features, and on a busy machine they wait for one another: an

@@ -183,6 +183,22 @@ def test_a_bot_that_hits_the_car_from_behind_stops_all_bots_and_is_to_blame(race
     assert (others.poses != standing).any()
 
 
+def test_a_car_hit_from_behind_as_its_time_is_up_has_not_crashed(race_of, spy):
+    def hit(*more: str) -> Race:
+        race = race_of(ON, *BOTS, spy, "race.bots.lane_change_after_s=null", *STANDING, *more)
+        others = race.others.others
+        stop(race, 3)
+        put(race, float(others.distance_m[0, 2]) + 0.5, float(others.offset_m[0, 2]))
+        while not others.pauses[0]:
+            stop(race, 1)
+        return race
+
+    steps = int(hit().rules.steps[0])
+    race = hit(f"episode.max_steps={steps}")
+    assert race.truncated[0] or race.terminated[0]
+    assert spied(race)[0][-1]["is_crashed"] is False
+
+
 def test_a_car_that_runs_into_a_bot_from_behind_has_crashed(race_of):
     race = race_of(
         ON,

@@ -9,11 +9,19 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.race_protocol import Attempt, RaceProtocol
 from deepracer_exp.evaluation.rival_protocol import DRAWN, LOST, WON, RivalProtocol
-from tests.conftest import OFTEN, POOL, THREE
+from tests.conftest import OFTEN, POOL, THREE, refused
 
 from .conftest import Driver
 
 FAST, SLOW = 0.0, -0.3
+
+
+def test_a_rival_is_no_physical_car(protocol):
+    seen = ("observation=camera", "network=cnn_small", "action_space=real_car")
+    experiment = compose_experiment(["race=head_to_head", "observation.next_objects=1", *seen])[0]
+    assert "a rival is not driven as the physical car" in refused(
+        Evaluator, experiment, protocol("real_car", trials=2)
+    )
 
 
 @pytest.fixture(scope="module")

@@ -196,10 +196,13 @@ def test_a_written_film_shows_its_last_frame_for_a_second(tmp_path):
     assert np.abs(np.array(shades) - [20 * min(at, 9) for at in range(40)]).max() < 6
 
 
+@pytest.mark.parametrize("penalty_s", [2, 0])
 @pytest.mark.parametrize(("control_hz", "frames"), [(15, 9), (30, 5), (20, 7), (60, 3)])
-def test_between_steps_a_filmed_car_drives_on_but_not_where_it_was_put_back(circle, control_hz, frames):
+def test_between_steps_a_filmed_car_drives_on_but_not_where_it_was_put_back(
+    circle, control_hz, frames, penalty_s
+):
     x_m = np.array([0.0, 0.1, 0.2, 5.0, 5.1])
-    time_s = np.arange(5) / control_hz + np.array([0, 0, 0, 2, 2])  # 2 s of penalty
+    time_s = np.arange(5) / control_hz + penalty_s * np.array([0, 0, 0, 1, 1])
     nothing, yaw_rad = np.zeros(5), np.array([3.1, -3.1, -3.0, 0.0, 0.1])
     lap = Lap(None, Track.from_file(circle), "", x_m, nothing, yaw_rad, nothing, nothing, 10 * x_m, time_s)
     shown, step = in_frames(lap, control_hz)
