@@ -1,5 +1,6 @@
 """The files that the AWS console and deepracer-for-cloud train from: reward function, action space, hyperparameters."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 from deepracer_exp.aws.models.hyperparameters import CONSOLE_RANGES, Hyperparameters, hyperparameters_text
 from deepracer_exp.aws.models.model_metadata import (
     LIDARS,
+    NEURAL_NETWORKS,
     LidarSectors,
     ModelMetadata,
     beyond_console,
@@ -16,7 +18,8 @@ from deepracer_exp.commands.validation.aws_rules import text_findings
 from deepracer_exp.config.custom_files.model_files import CARS, SAC_TAKEN, TAKEN
 from deepracer_exp.config.driving import ObservationConfig
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.config.learning import SACConfig
+from deepracer_exp.config.learning import CNNConfig, SACConfig
+from deepracer_exp.config.named import services_layers
 from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.errors import BadInput, count
 from deepracer_exp.runs.stored_run import StoredRun
@@ -55,7 +58,12 @@ def aws_files(experiment: Experiment, reward: str) -> tuple[dict[str, str], list
         "model_metadata.json": model_metadata_text(metadata),
         "hyperparameters.json": hyperparameters_text(learning),
     }
-    return texts, [*beyond_console(metadata), *changed]
+    notes = []
+    if isinstance(experiment.network, CNNConfig) and services_kind(experiment, metadata) is None:
+        notes.append(
+            f"model_metadata.json: neural_network={metadata.neural_network}: the service has no network like this run's"
+        )
+    return texts, [*notes, *beyond_console(metadata), *changed]
 
 
 def services_metadata(experiment: Experiment) -> ModelMetadata:
@@ -65,7 +73,29 @@ def services_metadata(experiment: Experiment) -> ModelMetadata:
     # The service's SAC has no lists of actions.
     algorithm = "sac" if isinstance(experiment.algorithm, SACConfig) and actions.low else "clipped_ppo"
     sensors = sensor_keys(experiment.observation)
-    return replace(actions, version=version, training_algorithm=algorithm, **sensors)
+    metadata = replace(actions, version=version, training_algorithm=algorithm, **sensors)
+    return replace(metadata, neural_network=services_kind(experiment, metadata) or NEURAL_NETWORKS[0])
+
+
+def services_kind(experiment: Experiment, metadata: ModelMetadata) -> str | None:
+    """Return the service's name of the network that an experiment trains; None: it builds no such network.
+
+    `metadata` has the sensors.
+    """
+    if not isinstance(experiment.network, CNNConfig):
+        return None
+    layers = network_layers(experiment)
+    for kind in NEURAL_NETWORKS:
+        services = services_layers(replace(metadata, neural_network=kind))
+        if all(list(value) == list(services[key]) for key, value in layers.items()):
+            return kind
+    return None
+
+
+def network_layers(experiment: Experiment) -> dict[str, Sequence[int]]:
+    """Return the layers of a network for pictures that the service's networks may differ in, by key."""
+    keys = ["filters", "kernels", "strides", "hidden", *["lidar_hidden"] * bool(experiment.observation.lidar)]
+    return {key: getattr(experiment.network, key) for key in keys}
 
 
 def sensor_keys(observation: ObservationConfig) -> dict[str, Any]:

@@ -13,12 +13,11 @@ from deepracer_exp.aws.models.model_metadata import (
     LIDARS,
     NEURAL_NETWORKS,
     ModelMetadata,
-    model_metadata_text,
 )
 from deepracer_exp.aws.worlds.catalogue import find_world
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.learning import CNNConfig
-from deepracer_exp.config.named import network_overrides, services_layers
+from deepracer_exp.config.named import network_overrides
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.errors import BadInput
@@ -27,11 +26,10 @@ from deepracer_exp.runs.run_result import read_result
 from deepracer_exp.runs.stored_run import StoredRun
 from deepracer_exp.tracks.track import Track
 
-from .aws_files import aws_files, services_metadata
+from .aws_files import aws_files, network_layers, services_kind, services_metadata
 from .written import Written, reward_text, write_files
 
 _PIXELS = 160, 120
-_LAYERS = ("filters", "kernels", "strides", "hidden", "lidar_hidden")
 
 
 def export_model(run: StoredRun, folder: Path) -> Written:
@@ -66,8 +64,7 @@ def aws_model(
     _refuse_other_sensors(experiment, metadata)
     networks, note = _with_value(experiment, stored.networks)
     tensors = to_service(networks, metadata.sensor)
-    metadata = replace(metadata, neural_network=services_kind(experiment, metadata))
-    texts["model_metadata.json"] = model_metadata_text(metadata)
+    _refuse_other_network(experiment, metadata)
     texts["training_params.yaml"], unknown = _training_params(experiment)
     # Where deepracer-for-cloud looks for it.
     texts["model/model_metadata.json"] = texts["model_metadata.json"]
@@ -100,26 +97,13 @@ def _refuse_other_sensors(experiment: Experiment, metadata: ModelMetadata) -> No
         raise BadInput(f"observation.lidar.yaw_deg={lidar.yaw_deg:g}", "", "180, as the service mounts it")
 
 
-def services_kind(experiment: Experiment, metadata: ModelMetadata) -> str:
-    """Return the service's name of the network.
-
-    Raises:
-        BadInput: it has none.
-    """
-    network = experiment.network
-    assert isinstance(network, CNNConfig)
-    layers = {
-        key: getattr(network, key) for key in _LAYERS if key != "lidar_hidden" or experiment.observation.lidar
-    }
-    options = []
-    for kind in NEURAL_NETWORKS:
-        built = replace(metadata, neural_network=kind)
-        services = services_layers(built)
-        if all(list(value) == list(services[key]) for key, value in layers.items()):
-            return kind
-        options.append(" ".join(network_overrides(built)))
-    shown = ", ".join(f"{key}={list(value)}" for key, value in layers.items())
-    raise BadInput("network", f"{shown}: the service builds no such network", "; or ".join(options))
+def _refuse_other_network(experiment: Experiment, metadata: ModelMetadata) -> None:
+    if services_kind(experiment, metadata) is None:
+        options = [
+            " ".join(network_overrides(replace(metadata, neural_network=kind))) for kind in NEURAL_NETWORKS
+        ]
+        shown = ", ".join(f"{key}={list(value)}" for key, value in network_layers(experiment).items())
+        raise BadInput("network", f"{shown}: the service builds no such network", "; or ".join(options))
 
 
 def _with_value(experiment: Experiment, networks: ActorCritic) -> tuple[ActorCritic, list[str]]:

@@ -36,8 +36,7 @@ from deepracer_exp.errors import BadInput
 from deepracer_exp.runs.next_steps import own_word
 from deepracer_exp.runs.stored_run import StoredRun
 
-from .aws_files import sensor_keys
-from .aws_model import services_kind
+from .aws_files import sensor_keys, services_kind
 from .written import Written, checkpoint_line, write_file
 
 
@@ -133,10 +132,10 @@ def car_archive(networks: PolicyNetworks, experiment: Experiment) -> CarArchive:
     graph = policy_graph(tensors, inputs, network.strides, bounds, tangent)
     check_weights(graph, tensors)
     values = json.loads(model_metadata_text(metadata))
-    try:
-        values["neural_network"] = services_kind(experiment, metadata)
-    except BadInput:  # the service has no such network; the car does not ask
+    if (kind := services_kind(experiment, metadata)) is None:  # the car does not ask
         del values["neural_network"]
+    else:
+        values["neural_network"] = kind
     if observation.lidar is not None:
         values["lidar_config"] = _lidar_config(observation.lidar)
     text = json.dumps(values, indent=2) + "\n"

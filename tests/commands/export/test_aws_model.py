@@ -1,7 +1,6 @@
 """What the service takes as a model of its own."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,8 @@ from deepracer_exp.agents.service_weights import VALUE, to_service
 from deepracer_exp.aws.models.model_metadata import NEURAL_NETWORKS, ModelMetadata, read_model_metadata
 from deepracer_exp.aws.models.tf_checkpoint import read_index, read_tensors
 from deepracer_exp.commands.export import aws_model as exporting
-from deepracer_exp.commands.export.aws_model import aws_model, services_kind
+from deepracer_exp.commands.export.aws_files import aws_files, services_metadata
+from deepracer_exp.commands.export.aws_model import aws_model
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.custom_files.model_files import sensor_overrides
 from deepracer_exp.config.named import network_overrides
@@ -42,7 +42,8 @@ def written(*overrides, score=None):
 def test_the_network_of_a_model_is_the_one_that_its_metadata_names(network, sensors):
     metadata = ModelMetadata(sensor=sensors, neural_network=network)
     experiment, _ = compose_experiment([*sensor_overrides(metadata), *network_overrides(metadata)])
-    assert services_kind(experiment, replace(metadata, neural_network=NEURAL_NETWORKS[0])) == network
+    assert services_metadata(experiment).neural_network == network
+    assert json.loads(aws_files(experiment, REWARD)[0]["model_metadata.json"])["neural_network"] == network
 
 
 def test_the_files_are_those_that_the_service_wants():
