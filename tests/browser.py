@@ -25,6 +25,7 @@ _FLAGS = (
     "--enable-unsafe-swiftshader",
     "--no-first-run",
     "--disable-extensions",
+    "--disable-dev-shm-usage",  # containers have little of it
 )
 
 

@@ -7,6 +7,7 @@ another order of the modules. It ends with the exit code of the first run that f
 """
 
 import argparse
+import dis
 import inspect
 import subprocess
 import sys
@@ -51,12 +52,24 @@ def _goes_outside(used: Any, seen: set[int]) -> bool:
     if isinstance(used, type) and used.__module__.startswith("tests."):
         return any(_goes_outside(method, seen) for method in vars(used).values())
     if isinstance(used, FunctionType) and used.__module__.startswith("tests."):
-        return any(_goes_outside(used.__globals__.get(name), seen) for name in _names(used.__code__))
+        return bool(_imported(used.__code__) & _OUTSIDE) or any(
+            _goes_outside(used.__globals__.get(name), seen) for name in _names(used.__code__)
+        )
     return False
 
 
 def _names(code: CodeType) -> set[str]:
-    return set(code.co_names).union(*(_names(one) for one in code.co_consts if isinstance(one, CodeType)))
+    return set(code.co_names).union(*map(_names, _within(code)))
+
+
+def _imported(code: CodeType) -> set[str]:
+    """Return the modules that code imports."""
+    modules = {line.argval for line in dis.get_instructions(code) if line.opname == "IMPORT_NAME"}
+    return modules.union(*map(_imported, _within(code)))
+
+
+def _within(code: CodeType) -> list[CodeType]:
+    return [one for one in code.co_consts if isinstance(one, CodeType)]
 
 
 def main() -> int:

@@ -13,8 +13,9 @@ def write_often(path, letter):
 def test_processes_that_write_the_same_file_do_not_disturb_each_other(tmp_path):
     path = tmp_path / "sweep.html"
     atomic_write(path, "")
-    forked = multiprocessing.get_context("forkserver")
-    writers = [forked.Process(target=write_often, args=(path, letter)) for letter in "abc"]
+    # No fork server: the first one of a process is the one that its trainings start workers from.
+    spawned = multiprocessing.get_context("spawn")
+    writers = [spawned.Process(target=write_often, args=(path, letter)) for letter in "abc"]
     for writer in writers:
         writer.start()
     while any(writer.is_alive() for writer in writers):

@@ -46,7 +46,8 @@ def driven(package: Path, **variables: str) -> tuple[float, int]:
     """Drive in a new process and return the speed, and how many signatures were taken from the disk."""
     code = "from deepracer_exp.sim.mujoco_model import drive; print(drive(8.0), sum(drive.stats.cache_hits.values()))"
     made = subprocess.run(
-        [sys.executable, "-c", code],
+        # Without bytecode: one of a file of the same second and size would be taken for the changed file's.
+        [sys.executable, "-B", "-c", code],
         cwd=package.parent,
         env=os.environ | {"XDG_CACHE_HOME": str(package.parent / "cache")} | variables,
         check=True,

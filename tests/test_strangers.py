@@ -136,6 +136,7 @@ def test_a_reward_function_of_a_stranger_is_not_run_until_it_is_named(stranger, 
         assert canary.exists()
 
 
+@pytest.mark.processes
 def test_a_run_of_ones_own_is_resumed_and_cloned_with_all_that_it_had(call, account, monkeypatch, tmp_path):
     (tmp_path / "mine.py").write_text(EVIL.format(canary=str(tmp_path / "first")))
     sent = tmp_path / "sent"
@@ -243,6 +244,7 @@ def test_the_words_that_choose_a_foreign_project_are_accepted_as_they_stand(acco
     assert trusted(compose_entry("train", chosen), stored=True).notes == ()
 
 
+@pytest.mark.processes
 def test_the_record_of_an_account_holds_no_text_and_is_its_own(call, account, tmp_path):
     ended = call("train", *TINY, "tracking=off", "budget.alert_command=true SECRET_TOKEN")
     assert ended.code == 0, ended.stderr

@@ -55,7 +55,7 @@ class Watchdog:
         self.verdict: dict[int, str] = {}
         """Why workers were ended, by their numbers."""
         self.first_dead: int | None = None
-        """The worker whose process ended first."""
+        """The worker whose process ended first; of those that ended together, one that failed."""
         self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
         self._thread.start()
 
@@ -66,7 +66,8 @@ class Watchdog:
         sentinels = [process.sentinel for process in processes]
 
         def wait_for_a_death() -> None:
-            self.first_dead = min(sentinels.index(int(ended)) for ended in wait(sentinels))  # type: ignore[arg-type]
+            ended = sorted(sentinels.index(int(sentinel)) for sentinel in wait(sentinels))  # type: ignore[arg-type]
+            self.first_dead = next((worker for worker in ended if processes[worker].exitcode), ended[0])
 
         threading.Thread(target=wait_for_a_death, name="first death", daemon=True).start()
 

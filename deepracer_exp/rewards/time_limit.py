@@ -10,6 +10,8 @@ _LOOKS = 4
 """Number of checks within the time limit."""
 _WAIT_FACTOR = 10
 """Wall-clock limit of code that waits, as in `sleep`, as a multiple of the CPU limit."""
+_WAITS = 0.01
+"""Share of the time between two looks: code that computes less than this waits."""
 
 
 def run_module(code: CodeType, namespace: dict[str, Any]) -> None:
@@ -26,7 +28,7 @@ class TimeLimit:
 
     The limit is CPU time of this thread: however busy the machine is, only the code itself can use it up. Code that
     waits without computing is ended after `_WAIT_FACTOR` times the limit, of which a pause of the whole process uses
-    up one look.
+    up one look, and the time in which the code computes on a busy machine none.
 
     Python passes signals on to the main thread, between two of its instructions. In other threads, on platforms without
     interval timers and within code in C there is no limit; a worker that hangs there is ended by the watchdog.
@@ -37,13 +39,15 @@ class TimeLimit:
 
     def __init__(self, limit_s: float) -> None:
         self._limit_s = limit_s
-        self._looks = 0
+        self._waits = 0
+        """Looks since whose last one the code has not computed."""
         self._is_over = False
         self._holds = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
 
     def __enter__(self) -> Self:
         if self._holds:
-            self._began_s, self._cpu_began_s = time.monotonic(), time.thread_time()
+            self._began_s = time.monotonic()
+            self._cpu_began_s = self._cpu_s = time.thread_time()
             self._handler = signal.signal(signal.SIGALRM, self._check)
             every_s = self._limit_s / _LOOKS
             self._timer = signal.setitimer(signal.ITIMER_REAL, every_s, every_s)
@@ -63,10 +67,11 @@ class TimeLimit:
     def _check(self, signum: int, frame: FrameType | None) -> None:
         if self._is_over or frame is None or frame.f_code.co_filename == __file__:
             return
-        self._looks += 1
+        before_s, self._cpu_s = self._cpu_s, time.thread_time()
+        self._waits += self._cpu_s - before_s < _WAITS * self._limit_s / _LOOKS
         limit = f"the time limit of {self._limit_s:g} s of CPU for one step"
-        if time.thread_time() - self._cpu_began_s >= self._limit_s:
+        if self._cpu_s - self._cpu_began_s >= self._limit_s:
             raise TimeLimitPassed(f"took longer than {limit}")
-        if self._looks >= _WAIT_FACTOR * _LOOKS:
+        if self._waits >= _WAIT_FACTOR * _LOOKS:
             waits = f"{self._limit_s * _WAIT_FACTOR:g} s without computing: {_WAIT_FACTOR} times {limit}"
             raise TimeLimitPassed(f"took longer than {waits}")

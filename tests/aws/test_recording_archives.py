@@ -173,6 +173,7 @@ def test_an_archive_of_metrics_alone_is_read(tmp_path):
     assert len(recording.metrics) == 6
 
 
+@pytest.mark.processes
 def test_a_folder_may_hold_more_archives_than_a_process_may_open(tmp_path):
     made.write_folder(made.drfc_single(), tmp_path)
     for number in range(60):

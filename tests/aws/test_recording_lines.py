@@ -275,6 +275,7 @@ def test_a_truncated_archive_gives_what_can_be_read(tmp_path):
     assert max(seen) <= whole
 
 
+@pytest.mark.processes
 def test_a_large_log_with_few_trace_lines_takes_little_memory(tmp_path):
     log = tmp_path / "large.log"
     noise = (

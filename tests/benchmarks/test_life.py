@@ -93,6 +93,7 @@ for number in range(done + 1, 11):
 """Counts to ten, and continues where it was killed."""
 
 
+@pytest.mark.processes
 def test_a_run_is_killed_as_often_as_asked_even_if_it_is_much_faster_than_expected(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -27,7 +27,6 @@ def processes():
 def watch(tmp_path, monkeypatch, processes):
     """Watch two workers, which have begun, with a limit longer than this thread may have to wait for a core."""
     monkeypatch.setattr(watchdog, "LOOK_EVERY_S", 0.05)
-    monkeypatch.setattr(watchdog, "_START_TIMEOUT_S", 1.0)
     made = []
 
     def make(timeout_s: float = 2.0) -> Watchdog:
@@ -96,10 +95,10 @@ def test_workers_that_hang_after_the_last_step_of_their_parts_are_ended(watch, b
 
 
 def test_a_worker_that_is_waited_for_is_named_now_and_then(watch, beats, monkeypatch, caplog):
-    monkeypatch.setattr(watchdog, "_SAY_EVERY_S", 0.2)
     dog = watch(600.0)
     beats()[:] = 10, 1
     dog.expect(10)
+    monkeypatch.setattr(watchdog, "_SAY_EVERY_S", 0.2)
     wait_until(lambda: len(caplog.records) > 2, "lines")
     assert {record.args[0] for record in caplog.records} == {1}
     assert "collector worker 1 has taken no step for " in caplog.text

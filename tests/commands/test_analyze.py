@@ -172,6 +172,7 @@ def test_bad_input_is_one_line(run_dir, call, tmp_path, arguments, words):
     assert not [*tmp_path.glob("*.html"), *tmp_path.glob("line.*")]
 
 
+@pytest.mark.processes
 def test_a_training_ends_with_its_page_which_stands_in_its_mlflow_run_too(call):
     from mlflow import MlflowClient
 

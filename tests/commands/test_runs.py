@@ -28,7 +28,7 @@ def stamp(seconds_ago: float) -> str:
 
 
 def test_runs_are_listed_newest_first_with_state_and_results(call, tmp_path):
-    names = [f"{stamp(seconds)}-{name}" for seconds, name in ((200_000, "old"), (7_300, "mid"), (90, "new"))]
+    names = [f"{stamp(seconds)}-{name}" for seconds, name in ((200_000, "old"), (7_300, "mid"), (61, "new"))]
     finished = {
         "status": "finished",
         "laps": 1234,

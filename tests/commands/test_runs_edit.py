@@ -68,7 +68,7 @@ def test_a_name_a_note_and_tags_are_in_the_folder_and_in_mlflow_and_find_the_run
 
 def test_conditions_and_an_order_hold_of_what_is_listed_in_every_format(season, call):
     for number, score in enumerate([9.0, 7.5, None, 8.0]):
-        run = season.run(f"2026110{number + 1}-120000-oval")
+        run = season.run(f"2026110{2 * number + 1}-120000-oval")
         season.result(run, best={"eval_race_score_s": score}, laps=number)
     rows = listed(call, "--where", "score_s<9", "--sort", "score_s")
     assert [row["score_s"] for row in rows] == [7.5, 8.0]
@@ -80,7 +80,7 @@ def test_conditions_and_an_order_hold_of_what_is_listed_in_every_format(season, 
     ]
     assert [
         row["exploring_laps"]
-        for row in listed(call, "--where", "began>=2026-11-03", "--where", "exploring_laps!=3")
+        for row in listed(call, "--where", "began>=2026-11-04T00", "--where", "exploring_laps!=3")
     ] == [2]
     assert listed(call, "--where", "run~NOTHING") == []
     table = call("runs", "list", "--where", "state=finished", "--format", "csv").stdout

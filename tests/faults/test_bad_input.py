@@ -114,6 +114,7 @@ def test_a_model_metadata_that_is_none_is_refused_with_its_name(train_here, tmp_
     train_here(f"action_space.file={path}").assert_bad_input("model_metadata.json", word)
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize(
     ("text", "words"),
     [

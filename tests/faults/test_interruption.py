@@ -8,7 +8,9 @@ import time
 import pytest
 
 from deepracer_exp.runs.trace import read_trace
+from deepracer_exp.training import signals
 from tests.conftest import IN_WORKERS, iterations
+from tests.waiting import PATIENCE_S
 
 from .conftest import meanwhile
 
@@ -27,7 +29,11 @@ def _assert_whole(ended, code):
 
 
 @pytest.mark.usefixtures("workers_start_early")
-def test_ctrl_c_of_a_training_in_this_process_writes_everything(call, tmp_path):
+def test_ctrl_c_of_a_training_in_this_process_writes_everything(call, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        signals, "PATIENCE_S", PATIENCE_S
+    )  # the present iteration may end, however long it takes
+
     def press() -> None:
         workers = [one.pid for one in multiprocessing.active_children()]
         assert len(workers) == 2

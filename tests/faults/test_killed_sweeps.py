@@ -33,7 +33,11 @@ SWEEP = (
     *(f"sweep.trials={TRIALS}", "sweep.lease_s=6"),
 )
 
-SMALL = ("budget.iterations=2", "algorithm.frames_per_iteration=256", "checkpoints.every=1")
+# Its workers end or die, and their driver knows: no lease has to run out.
+SMALL = (
+    *("budget.iterations=2", "algorithm.frames_per_iteration=256", "checkpoints.every=1"),
+    "sweep.lease_s=3600",
+)
 
 
 class Sweep:

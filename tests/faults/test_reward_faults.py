@@ -59,6 +59,7 @@ def reward(tmp_path):
     return write
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize(
     ("line", "words"),
     [
@@ -114,6 +115,7 @@ def test_a_reward_that_is_deaf_to_its_time_limit_is_ended_by_the_watchdog(start_
     training.assert_nothing_left()
 
 
+@pytest.mark.processes
 def test_a_million_printed_lines_neither_end_the_run_nor_fill_the_disk(train_here, reward):
     override = reward("    for i in range(250): print('step', i, params['steps'])", "    return 1.0")
     ended = train_here(override)

@@ -186,6 +186,7 @@ def test_the_rays_of_a_film_end_at_the_walls(protocol, yaw_deg):
     assert np.linalg.norm(sensor[0, 0] - front) == pytest.approx(front_m - MOUNT_X_M)
 
 
+@pytest.mark.processes
 def test_a_written_film_shows_its_last_frame_for_a_second(tmp_path):
     frames = [np.full((32, 48, 3), 20 * at, np.uint8) for at in range(10)]
     write_film(tmp_path / "lap.mp4", frames, len(frames), (48, 32), Console(file=io.StringIO()))
@@ -260,6 +261,7 @@ def test_the_live_page_changes_when_there_is_a_newer_checkpoint(run_dir, protoco
     assert {path for path in after - before if path.parts[:2] != ("checkpoints", "999999")} == set()
 
 
+@pytest.mark.processes
 def test_the_live_page_tells_a_running_training_from_one_that_was_killed_or_has_ended(
     run_dir, protocol, monkeypatch
 ):
@@ -354,6 +356,7 @@ def test_a_browser_that_leaves_before_it_has_the_page_is_no_error(capfd):
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.processes
 def test_the_film_is_put_into_the_folder_of_the_run(run_dir, call):
     ended = call("watch", str(run_dir), "evaluation.trials=1", "evaluation.time_s=0.6")
     assert ended.code == 0, ended.stderr

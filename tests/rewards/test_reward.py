@@ -1,6 +1,7 @@
 import hashlib
 import pickle
 import signal
+import time
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
@@ -174,6 +175,7 @@ def test_the_line_is_that_of_the_reward_file_even_if_a_library_raised() -> None:
 CTRL_C = "import os, signal; os.kill(os.getpid(), signal.SIGINT)"
 
 
+@pytest.mark.processes
 def test_ctrl_c_is_the_users() -> None:
     with pytest.raises(KeyboardInterrupt):
         function(f"{CTRL_C}; return 1.0")(columns(3), ROAD)
@@ -187,6 +189,7 @@ def test_a_second_sigterm_while_the_reward_runs_is_not_its_fault() -> None:
             reward(columns(3), ROAD)
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize(
     "body",
     [
@@ -201,21 +204,24 @@ def test_a_reward_that_hangs_is_stopped_by_the_time_limit(body: str) -> None:
     assert error.car == 0
 
 
+@pytest.mark.processes
 def test_a_reward_that_sleeps_for_ever_is_stopped_too() -> None:
     error = failure(function("\n    import time\n    time.sleep(600)", time_limit_s=0.02))
     assert "reward_function took longer than 0.2 s without computing: 10 times the time limit" in str(error)
 
 
+@pytest.mark.processes
 def test_a_busy_machine_never_fails_a_good_reward() -> None:
     """Each call waits longer than its limit, as on a machine that has no time for it, but computes next to nothing."""
     reward = function("import time; time.sleep(0.2); return 1.0", time_limit_s=0.1)
     np.testing.assert_array_equal(reward(columns(3), ROAD), np.ones(3))
 
 
+@pytest.mark.processes
 def test_time_in_which_the_whole_process_was_stopped_does_not_count() -> None:
-    stop = (
-        "import os, signal, subprocess; subprocess.Popen(['sh', '-c', f'sleep 1; kill -CONT {os.getpid()}'])"
-    )
+    # Again and again: on a busy machine the first signal may come before the stop.
+    wake = "for _ in $(seq 60); do sleep 1; kill -CONT {os.getpid()} || exit; done"
+    stop = f"import os, signal, subprocess; subprocess.Popen(['sh', '-c', f'{wake}'])"
     body = f"{stop}; os.kill(os.getpid(), signal.SIGSTOP); return 1.0"
     np.testing.assert_array_equal(function(body, n_cars=1, time_limit_s=0.05)(columns(1), ROAD), [1.0])
 
@@ -225,12 +231,14 @@ def test_timer_and_handler_found_are_put_back() -> None:
         raise AssertionError("must not fire")
 
     handler = signal.signal(signal.SIGALRM, mine)
+    began_s = time.monotonic()
     timer = signal.setitimer(signal.ITIMER_REAL, 1000.0)
     try:
         function("return 1.0")(columns(3), ROAD)
         failure(function("raise ValueError"))
         assert signal.getsignal(signal.SIGALRM) is mine
-        assert 990.0 < signal.getitimer(signal.ITIMER_REAL)[0] <= 1000.0
+        most_s = 1000.0 - (time.monotonic() - began_s)
+        assert most_s - 0.1 <= signal.getitimer(signal.ITIMER_REAL)[0] <= 1000.0
     finally:
         signal.signal(signal.SIGALRM, handler)
         signal.setitimer(signal.ITIMER_REAL, *timer)
@@ -266,6 +274,7 @@ def test_constants_are_those_of_the_config() -> None:
     np.testing.assert_array_equal(function(text, WEIGHT=4.5)(columns(3), ROAD), [9.0] * 3)
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -311,6 +320,7 @@ def test_a_batch_function_is_called_once_for_all_active_cars() -> None:
     np.testing.assert_array_equal(reward(columns(3), ROAD, np.array([True, False, True])), [20.0, 0.0, 22.0])
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize(
     ("body", "car", "message"),
     [

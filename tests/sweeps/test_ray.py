@@ -137,6 +137,7 @@ def test_without_ray_the_extra_is_named(call, monkeypatch):
     )
 
 
+@pytest.mark.processes
 def test_a_cluster_that_does_not_answer_is_refused_before_anything_is_made(call, monkeypatch):
     pytest.importorskip("ray")
     monkeypatch.delenv("RAY_ADDRESS", raising=False)

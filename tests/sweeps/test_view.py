@@ -3,6 +3,7 @@
 import io
 from types import SimpleNamespace
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -68,6 +69,7 @@ def test_it_counts_trials_by_state_and_names_the_best():
         assert words in view
 
 
+@pytest.mark.processes
 def test_the_time_left_is_estimated_from_the_pace_of_this_start_only():
     assert "min left" in shown([*ENDED, claim(2)], after_s=600)
     assert "not known yet" in shown([*ENDED, claim(2)], first=[*ENDED, claim(2)], after_s=600)

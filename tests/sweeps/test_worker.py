@@ -64,6 +64,7 @@ def made(tmp_path, monkeypatch, *asked: str) -> list[FrozenTrial]:
     return optuna.load_study(study_name="s", storage=storage).trials
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize("sampler", ["tpe", "gp", "cmaes", "random", "grid", "optuna.samplers:NSGAIISampler"])
 def test_with_every_sampler_all_trials_draw_their_values_and_are_reported(sampler, tmp_path, monkeypatch):
     searched = SPACE.get(sampler, MIXED)
@@ -73,6 +74,7 @@ def test_with_every_sampler_all_trials_draw_their_values_and_are_reported(sample
     assert len({tuple(trial.params.values()) for trial in trials}) == 3
 
 
+@pytest.mark.processes
 def test_values_drawn_again_are_trained_with_the_next_seed(tmp_path, monkeypatch):
     asked = ("network=mlp_small,mlp", "seed=7", "sweep.sampler=random", "sweep.trials=6", "sweep.seeds=2")
     seeds: dict[str, list[int]] = {}
@@ -99,6 +101,7 @@ def test_a_worker_lost_before_it_created_its_trial_leaves_no_gap_and_changes_no_
     assert [trial.params for trial in trials] == [trial.params for trial in undisturbed]
 
 
+@pytest.mark.processes
 def test_a_trial_that_another_worker_creates_meanwhile_is_not_created_again(tmp_path, monkeypatch):
     one, storage = worker(
         tmp_path, "algorithm.lr=interval(1e-5,1e-3)", "sweep.sampler=random", "sweep.trials=2"

@@ -138,13 +138,14 @@ def test_a_run_that_a_training_holds_stays_until_it_is_released(season):
     assert [what for _, what, _ in listed(season)] == [SPARE_CHECKPOINTS, FAILED_TRACE]
 
 
+@pytest.mark.processes
 def test_a_run_without_an_end_stays_for_an_hour_after_its_last_change(season):
     run = season.run("1", status=None)
     assert listed(season) == []
     assert "has not ended" in kept(season)["1"]
-    age(run, HOUR_S - 120)
+    age(run, HOUR_S / 2)
     assert listed(season) == []
-    age(run, 240)
+    age(run, HOUR_S)
     assert listed(season) == [("1", SPARE_CHECKPOINTS, ["000010"])]
     (run / "metrics.jsonl").write_text("{}\n")
     assert listed(season) == []

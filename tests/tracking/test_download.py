@@ -35,6 +35,7 @@ def files_of(client) -> Path:
     return Path(logged.artifact_location.removeprefix("file://")) / "checkpoint"
 
 
+@pytest.mark.processes
 def test_a_promoted_model_is_downloaded_whole_once_and_as_it_was_registered(away, season, client):
     found = resolve("season@champion", season.runs_dir, None)
     assert (found.path, found.checkpoint) == (away, "000020")

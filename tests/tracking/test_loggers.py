@@ -115,6 +115,7 @@ def test_wandb_has_only_rows_that_a_checkpoint_covers_and_each_once(tmp_path, wa
         assert "race/lap_time_s" not in rows[0]
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize("kind", [TENSORBOARD, WANDB])
 def test_a_missing_package_is_one_line_that_names_the_extra(call, kind, monkeypatch):
     import importlib.util

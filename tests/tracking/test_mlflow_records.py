@@ -126,6 +126,7 @@ def test_a_run_is_written_to_no_more_often_than_every_few_seconds(
         time.sleep(0.03)
     wait_until(lambda: sum(metrics for metrics, *_ in batches) == 20 * 3)
     assert len(batches) <= 1 + (time.monotonic() - began) / 0.3
+    tracker.finish("FINISHED")
 
 
 def test_a_parameter_that_is_refused_costs_no_metric(store, mlflow, tmp_path):
@@ -180,6 +181,7 @@ def test_a_server_that_is_down_costs_no_training_and_shows_no_password(
     assert not [file for file in tmp_path.glob("*.json") if "s3cr3t" in file.read_text()]
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize("kind", [TrackerHere, pytest.param(ProjectedTracker, marks=pytest.mark.faults)])
 def test_two_runs_that_begin_at_once_in_a_new_folder_lose_nothing(kind, tmp_path):
     """Recorded by threads, and by processes, which import MLflow for seconds each."""

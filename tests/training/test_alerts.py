@@ -7,6 +7,8 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.errors import BadInput
 from deepracer_exp.training.budget import Alerts
 
+pytestmark = pytest.mark.processes
+
 
 def send(run_dir: Path, message: str, *overrides: str) -> None:
     alerts = Alerts(compose_experiment(list(overrides))[0].budget)

@@ -101,6 +101,7 @@ def test_a_copy_continues_as_the_run_would_have_while_its_folder_is_held(tmp_pat
     holder.release()
 
 
+@pytest.mark.processes
 def test_a_copy_of_a_copy_is_another_run_of_mlflow_and_has_one_attempt_in_its_name(tmp_path, mlflow_here):
     one = ("tracking=mlflow", "budget.iterations=1")
     first = run(tmp_path / "runs", None, *one, run_name="trial 3", tags={"sweep.trial": "3"}).folder

@@ -114,6 +114,7 @@ def test_a_clone_keeps_what_the_networks_were_made_for(copied, call):
         call("clone", parent.name, *changes).assert_refused(*words)
 
 
+@pytest.mark.processes
 def test_a_promoted_model_says_that_it_reads_pictures(call, mlflow_here):
     evaluated = ("checkpoints.every=1", "evaluation.trials=1", "evaluation.time_s=1", "budget.env_steps=128")
     ended = call("train", *IN_PROCESS, *CAMERA, *evaluated, "tracking=mlflow", "name=eye")

@@ -139,6 +139,7 @@ def test_another_track_or_reward_is_allowed_and_warned_of(parent, call):
     assert config(child)["algorithm"]["lr"] == pytest.approx(1.3e-4)
 
 
+@pytest.mark.processes
 def test_in_mlflow_a_clone_stands_under_its_parent(call, mlflow_here):
     quick = ("experiment=tiny", "collector=in_process", "collector.threads=1", *OFTEN, *THREE)
     ended = call("train", *quick)

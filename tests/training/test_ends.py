@@ -51,6 +51,7 @@ def test_the_rule_comes_to_the_runs_decision_by_the_rows_of_its_metrics_alone(tr
     assert last.as_dict() == ended.summary["stopping"]
 
 
+@pytest.mark.processes
 def test_a_budgets_alerts_go_to_the_log_and_the_command(trained, tmp_path):
     command = tmp_path / "alert.sh"
     command.write_text('#!/bin/sh\necho "$1" >> alerts.txt\n')

@@ -106,6 +106,7 @@ def test_a_run_whose_schedules_are_held_is_one_that_was_never_interrupted(traine
     assert [row["lr"] for row in rows(run)[3:]] == pytest.approx([1.3e-4] * 3)
 
 
+@pytest.mark.processes
 def test_the_clock_begins_with_the_first_step_and_goes_on_where_it_stopped(cut, call, monkeypatch):
     seen = []
 
@@ -197,6 +198,7 @@ def test_a_resumed_run_that_fails_says_so_in_one_line(cut, call, monkeypatch):
     assert "Traceback" in (run / "log.txt").read_text()
 
 
+@pytest.mark.processes
 def test_a_run_killed_as_soon_as_it_is_one_begins_again_and_is_recorded_once(
     trained, call, mlflow_here, tmp_path, monkeypatch
 ):
@@ -282,6 +284,7 @@ def test_a_run_that_was_stopped_uses_its_budget_up_if_no_rule_is_asked_for(train
     assert (found["reason"], found["stopping"]) == ("budget reached: iterations", None)
 
 
+@pytest.mark.processes
 def test_mlflow_does_not_name_a_rule_that_no_longer_ends_the_run(call, mlflow_here):
     quick = ("experiment=tiny", "collector=in_process", "collector.threads=1", *OFTEN)
     ended = call("train", *quick, *SOON, "budget.env_steps=null", "budget.iterations=4")

@@ -102,6 +102,7 @@ def test_the_same_seed_gives_the_same_run_in_one_process_and_in_several(call, tm
     assert len(read_trace(folders[0] / "trace", ["steps"])) == 1024
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize(
     ("limits", "reason", "iterations"),
     [

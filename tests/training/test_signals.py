@@ -9,6 +9,7 @@ from deepracer_exp.training.signals import Interruption
 from tests.waiting import wait_until
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize(("signum", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_is_noted_and_nothing_else_happens(signum, code):
     with Interruption() as interruption:

@@ -3,6 +3,8 @@ import pytest
 from deepracer_exp.commands.validation.aws_dry_run import dry_run_findings, validator_params
 from deepracer_exp.commands.validation.aws_rules import text_findings
 
+pytestmark = pytest.mark.processes
+
 ACCEPTED = [
     *("np.float64(2.0)", "params['x']", "-1e5"),
     "float(params['steps'] + np.sum(params['waypoints']) > 0) + float(len(params['objects_location']) == 6)",

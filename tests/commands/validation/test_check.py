@@ -12,6 +12,8 @@ def function(body: str, before: str = "") -> str:
     return f"{before}def reward_function(params):\n    " + body.replace("\n", "\n    ") + "\n"
 
 
+pytestmark = pytest.mark.processes
+
 DELTA = """\
 last = {"progress": 0.0, "steps": 0.0}
 def reward_function(params):

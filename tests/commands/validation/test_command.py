@@ -12,7 +12,7 @@ from deepracer_exp.reports.tables.line_file import racing_line_table, write_line
 from deepracer_exp.rewards.source import zoo_names
 from deepracer_exp.tracks.track import world_track
 
-pytestmark = pytest.mark.usefixtures("coarsely")
+pytestmark = [pytest.mark.usefixtures("coarsely"), pytest.mark.processes]
 
 REWARD = "def reward_function(params):\n    return {pay}\n"
 
