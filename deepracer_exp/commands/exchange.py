@@ -117,6 +117,7 @@ def _import_model(args: argparse.Namespace) -> int:
     import zipfile
 
     from deepracer_exp.runs.next_steps import own_word
+    from deepracer_exp.runs.stored_run import StoredRun
 
     from .import_model import import_model
 
@@ -126,7 +127,11 @@ def _import_model(args: argparse.Namespace) -> int:
         print(path)
     run = shlex.quote(own_word(imported.folder))
     print(f"\n  race it            deepracer-exp evaluate {run}")
-    print(f"  train it further   deepracer-exp clone {run}")
+    if (reward := StoredRun(imported.folder).experiment.reward.file) is None:
+        print(f"  train it further   deepracer-exp clone {run}")
+    else:
+        named = shlex.quote(f"reward.file={os.path.relpath(reward)}")
+        print(f"  train it further   deepracer-exp clone {run} {named}   # once you have read this file")
     if imported.has_logs and not zipfile.is_zipfile(args.path):
         print(f"  its training       deepracer-exp analyze {shlex.quote(args.path)}")
     return 0

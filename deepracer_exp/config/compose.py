@@ -29,7 +29,7 @@ from .option_files import change, composed, composed_option, first_line, plain
 from .options import groups, listed, options
 from .overrides import PLAIN_TEXT, override_line, parse_single, parse_sweep
 from .own_class import allow, allow_given, own_option
-from .parse import import_own_classes, parse_config, parse_experiment
+from .parse import import_own_classes, parse_config, parse_experiment, take_over_files
 from .track_options import ALL, by_world_name, several_tracks
 from .track_options import GROUP as TRACK
 
@@ -54,7 +54,7 @@ class Composition:
     notes: tuple[str, ...] = ()
     """Notes on the use of each file of `custom_files`, a line each."""
     names: Mapping[str, str] = field(default_factory=dict)
-    """Display names of the choices that come from `custom_files`, by group."""
+    """Display names of the choices that come from files, by group."""
 
     def yaml(self) -> str:
         """Return the values as YAML, in the order of the entry point's groups."""
@@ -78,12 +78,13 @@ def compose_experiment(overrides: Sequence[str], *, stored: bool = False) -> tup
     """
     files = with_custom_files(without_passwords(list(overrides)))
     composition = trusted(compose_entry("train", files.lines), stored=stored)
+    names = {**take_over_files(composition.mapping), **files.names}
     experiment = parse_experiment(composition.mapping)
     check_names(experiment.evaluation)
     acting.refuse_reward(experiment.reward.file, "the study")
     import_own_classes(experiment)
     notes = (*files.notes, *composition.notes)
-    return experiment, replace(composition, overrides=files.typed, names=files.names, notes=notes)
+    return experiment, replace(composition, overrides=files.typed, names=names, notes=notes)
 
 
 def trusted(composition: Composition, *, stored: bool) -> Composition:

@@ -5,10 +5,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
+from deepracer_exp.aws.models.model_metadata import ModelMetadata, read_model_metadata
 from deepracer_exp.aws.worlds.catalogue import worlds
 from deepracer_exp.errors import BadInput, Unknown, nearest
 
@@ -29,6 +31,42 @@ def parse_experiment(mapping: dict[str, Any]) -> Experiment:
     experiment = parse_config(mapping, Experiment)
     _check_combinations(experiment)
     return experiment
+
+
+def take_over_files(values: dict[str, Any]) -> dict[str, str]:
+    """Put what files say into an experiment's values, so that these stay true when a file changes.
+
+    The actions of `action_space.file` replace its path, and a single track of a file is called like the file.
+
+    Returns:
+        The display name of the action space; empty where it has no file.
+
+    Raises:
+        BadInput: the file of the action space is not a model_metadata.json.
+    """
+    track, space = values.get("track"), values.get("action_space")
+    if isinstance(track, dict) and isinstance(file := track.get("file"), str):
+        values["track"] = {**track, "name": Path(file).stem, "title": Path(file).stem}
+    file = space.get("file") if isinstance(space, dict) else None
+    if not isinstance(file, str):
+        return {}
+    values["action_space"] = {**action_space_values(read_model_metadata(file)), "file": None}
+    return {"action_space": Path(file).stem}
+
+
+def action_space_values(metadata: ModelMetadata) -> dict[str, Any]:
+    """Return the values of the group `action_space` for a model's actions, without `file`."""
+    low, high = metadata.low, metadata.high
+    if low is None or high is None:
+        listed = [
+            {"steering_angle": action.steering_deg, "speed": action.speed_mps} for action in metadata.actions
+        ]
+        return {"kind": "discrete", "actions": listed}
+    return {
+        "kind": "continuous",
+        "steering_angle": {"low": low.steering_deg, "high": high.steering_deg},
+        "speed": {"low": low.speed_mps, "high": high.speed_mps},
+    }
 
 
 def parse_config(mapping: dict[str, Any], kind: type[Config]) -> Config:

@@ -15,7 +15,7 @@ from .evaluation import EvaluateConfig, EvaluationConfig
 from .options import groups
 from .overrides import OPEN_MAPPINGS, group_of, key_of, parse_single
 from .own_class import allow, allow_given
-from .parse import parse_config
+from .parse import parse_config, take_over_files
 
 _WHOLE = ("experiment", model_files.KEY)
 ABSENT = "\N{EN DASH}"
@@ -76,9 +76,10 @@ def with_overrides(
         for change in parsed:
             allow({change.key_or_group.rpartition(".")[2]: change.value()})
         acting.name([value for value in acting.acting(values) if _touches(keys, value.key)])
+    names = take_over_files(values)
     return Composition(
         overrides=tuple(overrides),
-        choices={**choices, **new},
+        choices={**choices, **new, **names},
         mapping=values,
         notes=tuple(line for line in left_out if not _touches(keys, line.partition("=")[0])),
     )

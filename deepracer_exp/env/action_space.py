@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from deepracer_exp.aws.models.model_metadata import Action, ModelMetadata, read_model_metadata
+from deepracer_exp.aws.models.model_metadata import Action, ModelMetadata
 from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.driving import (
     ActionSpaceConfig,
@@ -79,18 +79,13 @@ ActionSpace = DiscreteActions | ContinuousActions
 
 
 def build_action_space(config: ActionSpaceConfig) -> ActionSpace:
-    """Build the action space of an experiment; `config.file` replaces everything else in it.
+    """Build the action space of an experiment; `config.file` is null, its actions are in the other values.
 
     The simulator's limits of steering and speed are not applied here: the trace has the unclipped commands.
 
     Raises:
-        BadInput: contradictory values, an empty list, or a bad model_metadata.json.
+        BadInput: contradictory values, or an empty list.
     """
-    if config.file is not None:
-        metadata = read_model_metadata(config.file)
-        if metadata.low is not None and metadata.high is not None:
-            return ContinuousActions(np.array(metadata.low), np.array(metadata.high))
-        return _discrete(*zip(*metadata.actions, strict=True))
     if isinstance(config, DiscreteActionSpace):
         if not config.actions:
             raise BadInput("action_space.actions", "[] is empty", "at least one steering_angle and speed")

@@ -21,6 +21,7 @@ from filelock import FileLock, Timeout
 
 from deepracer_exp.addresses import redact, without_passwords
 from deepracer_exp.config.compose import Composition
+from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.files import atomic_write, read_json
 from deepracer_exp.rewards.source import RewardSource, source_with_constants
@@ -43,6 +44,7 @@ from .run_files import (
     read_metrics,
     who_and_where,
 )
+from .stored_run import track_hashes
 
 logger = logging.getLogger("deepracer_exp")
 
@@ -85,9 +87,9 @@ class RunFolder:
             ) from error
 
     def describe(
-        self, composition: Composition, reward: RewardSource, seed: int, names: Mapping[str, str]
+        self, composition: Composition, reward: RewardSource, experiment: Experiment, names: Mapping[str, str]
     ) -> str | None:
-        """Write the configuration and the provenance of code and reward; return the git commit if there is one.
+        """Write the configuration and the provenance of code and files; return the git commit if there is one.
 
         config.yaml makes a folder a run, and is written last: a run that was killed at any moment can be resumed.
         `names` are readable names of its choices.
@@ -99,7 +101,7 @@ class RunFolder:
         provenance = {
             "versions": {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES},
             "git_commit": commit,
-            "seed": seed,
+            "seed": experiment.seed,
             "names": dict(names),
             "machine": {
                 **who_and_where(),
@@ -108,6 +110,7 @@ class RunFolder:
                 "memory_gib": round(psutil.virtual_memory().total / 2**30, 1),
             },
             "reward": {"name": reward.name, "path": str(reward.path), "sha256": reward.sha256},
+            "tracks": track_hashes(experiment),
             # A script's arguments have not been checked for passwords yet.
             "command": [redact(without_passwords(word)) for word in sys.argv[1:]],
         }

@@ -1,5 +1,7 @@
 """A run on disk, its configuration and the checkpoint chosen of it."""
 
+import contextlib
+import hashlib
 import logging
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -9,11 +11,12 @@ from typing import TYPE_CHECKING
 from deepracer_exp.config import acting
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.own_class import OF_POLICY
-from deepracer_exp.config.parse import import_own_classes, parse_experiment
+from deepracer_exp.config.parse import import_own_classes, parse_experiment, take_over_files
 from deepracer_exp.errors import BadInput
+from deepracer_exp.files import read_bytes
 
 from .checkpoint_files import find_checkpoint, restore_links
-from .run_files import CHECKPOINTS, CONFIG, read_config
+from .run_files import CHECKPOINTS, CONFIG, PROVENANCE, read_config, read_object
 
 if TYPE_CHECKING:
     from .checkpoints import StoredPolicy
@@ -37,15 +40,23 @@ class StoredRun:
     def experiment(self) -> Experiment:
         """Configuration of the run, without values that act and are not the user's own (`config.acting`).
 
+        A warning names each file of a track that has changed since the run began.
+
         Raises:
             BadInput: it cannot be read, or was written by another version.
         """
         mapping = read_config(self.path)
         acting.leave_out_foreign(mapping, self.path.name)
         try:
-            return parse_experiment(mapping)
+            take_over_files(mapping)  # an earlier version has kept their paths alone
+            experiment = parse_experiment(mapping)
         except BadInput as error:
             raise BadInput(self.path / CONFIG, f"{error}; was the run made by another version?") from None
+        recorded = read_object(self.path / PROVENANCE).get("tracks", {})
+        for file, sha256 in track_hashes(experiment).items():
+            if recorded.get(file, sha256) != sha256:
+                logger.warning("%s: %s has other contents than when the run began", self.path.name, file)
+        return experiment
 
     @property
     def checkpoints(self) -> Path:
@@ -94,3 +105,12 @@ class StoredRun:
             )
         assert self.checkpoint is not None
         return read_checkpoint(self.experiment, self.checkpoints, self.checkpoint)
+
+
+def track_hashes(experiment: Experiment) -> dict[str, str]:
+    """Return the hash of each file that an experiment's tracks are read from, by path; of those that can be read."""
+    hashes = {}
+    for file in filter(None, (track.file for track in experiment.tracks.values())):
+        with contextlib.suppress(BadInput):  # the track's reader says why
+            hashes[file] = hashlib.sha256(read_bytes(file, "a track")).hexdigest()
+    return hashes

@@ -13,7 +13,6 @@ import torch
 from rich.console import Console
 
 from deepracer_exp.agents.actor_critic import PolicyNetworks
-from deepracer_exp.config import acting
 from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.own_class import own_classes
@@ -99,7 +98,7 @@ def begin_run(
         if created is not None:
             created(folder.path)
         trainer.save(best=start is not None and lineage is None)  # of an imported run there is no other
-        commit = folder.describe(composition, setup.reward, experiment.seed, names)
+        commit = folder.describe(composition, setup.reward, experiment, names)
     except (OSError, RunFailed) as error:
         folder.remove()
         what = (
@@ -111,7 +110,6 @@ def begin_run(
         if isinstance(error, Exception) and (reason := own_error(error, experiment)):
             raise BadInput(reason) from error
         raise
-    acting.remember()
     for note in (*composition.notes, *plan.files.remarks):
         logger.info(note)
     if rival is not None:
@@ -160,12 +158,11 @@ def own_error(error: Exception, experiment: Experiment) -> str | None:
 
 def _names(composition: Composition, track: str, reward: str) -> dict[str, str]:
     """Return readable names of the run's choices: an option's name, a file's stem, the folder of custom_files."""
-    choices, mapping = composition.choices, composition.mapping
-    actions_file = mapping["action_space"].get("file")
+    choices = composition.choices
     return {
         "track": track,
         "reward": reward,
-        "action_space": Path(actions_file).stem if actions_file else choices["action_space"],
+        "action_space": choices["action_space"],
         "network": choices["network"],
         "lr_schedule": choices["lr_schedule"],
     } | dict(composition.names)

@@ -9,6 +9,7 @@ from types import MappingProxyType
 from rich.console import Console
 
 from deepracer_exp.agents.actor_critic import PolicyNetworks
+from deepracer_exp.config import acting
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.errors import NO_MEMORY, BadInput, RunFailed, is_refused_memory
 from deepracer_exp.runs.run_files import SUMMARY, TRACKING
@@ -71,6 +72,7 @@ def run_training(
         trainer = begin_run(
             plan, setup, console, start, callbacks, report, run_name, tags, created, projector
         )
+        acting.remember()  # of a stored model (`store_run`) nothing has been used
         print_lines([*rounded(plan.experiment), *memory], console)
         return _run(trainer, interruption)
 

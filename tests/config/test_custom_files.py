@@ -13,6 +13,7 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.learning import PPOConfig, SACConfig
 from deepracer_exp.config.overrides import override_line, parse_single
 from deepracer_exp.config.parse import parse_config, parse_experiment
+from deepracer_exp.config.stored import with_overrides
 from deepracer_exp.errors import BadInput
 from tests.conftest import refused
 
@@ -65,6 +66,24 @@ def test_ranges_make_a_continuous_action_space(custom_files):
     assert space.kind == "continuous"
     assert (space.steering_angle.low, space.steering_angle.high) == (-30, 30)
     assert (space.speed.low, space.speed.high) == (1, 2)
+
+
+@pytest.mark.parametrize("stored", [False, True], ids=["new", "changed"])
+def test_the_actions_of_a_file_are_kept_and_not_its_path(custom_files, stored):
+    file = custom_files() / "model_metadata.json"
+    override = f"action_space.file={file}"
+    if stored:
+        composition = with_overrides(
+            compose_experiment(["action_space=continuous"])[1].mapping, {}, [override]
+        )
+        name = composition.choices["action_space"]
+    else:
+        composition = compose_experiment([override])[1]
+        name = composition.names["action_space"]
+    file.unlink()
+    space = parse_experiment(yaml.safe_load(composition.yaml())).action_space
+    assert (name, space.file) == ("model_metadata", None)
+    assert [action.steering_angle for action in space.actions] == [-30, -15, 0, 15, 30]
 
 
 @pytest.mark.parametrize("left", ["hyperparameters", "metadata", "reward"])

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepracer_exp.config.car import CarConfig
-from deepracer_exp.config.compose import compose_option
+from deepracer_exp.config.compose import compose_experiment, compose_option
 from deepracer_exp.config.driving import (
     ActionSpaceConfig,
     ContinuousActionSpace,
@@ -154,31 +154,29 @@ def test_a_contradiction_is_named_with_its_key_and_both_numbers(
         assert word in message
 
 
-def with_file(config: ActionSpaceConfig, path: Path) -> ActionSpaceConfig:
-    return type(config)(**{**vars(config), "file": str(path)})
+def of_file(name: str, path: Path) -> ActionSpaceConfig:
+    return compose_experiment([f"action_space={name}", f"action_space.file={path}"])[0].action_space
 
 
 @pytest.mark.parametrize("name", ["discrete", "grid", "continuous"])
 def test_a_file_takes_the_place_of_every_kind_of_group(tmp_path: Path, name: str) -> None:
     path = tmp_path / "model_metadata.json"
     path.write_text(json.dumps({"action_space": [{"steering_angle": "12", "speed": "4.5"}]}))
-    space = build_action_space(with_file(compose_option("action_space", name, ActionSpaceConfig), path))
+    space = build_action_space(of_file(name, path))
     assert isinstance(space, DiscreteActions)
     # Beyond the car's 4 m/s: the simulator clips, the action space does not.
     assert (space.steering_deg.tolist(), space.speed_mps.tolist()) == ([12.0], [4.5])
 
     ranges = {"steering_angle": {"low": -12, "high": 20}, "speed": {"low": 1, "high": 2}}
     path.write_text(json.dumps({"action_space": ranges, "action_space_type": "continuous", "version": "5"}))
-    space = build_action_space(with_file(compose_option("action_space", name, ActionSpaceConfig), path))
+    space = build_action_space(of_file(name, path))
     assert isinstance(space, ContinuousActions)
     assert (space.low.tolist(), space.high.tolist()) == ([-12, 1], [20, 2])
 
 
 def test_a_missing_file_is_bad_input(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match=r"none\.json"):
-        build_action_space(
-            with_file(compose_option("action_space", "discrete", ActionSpaceConfig), tmp_path / "none.json")
-        )
+        of_file("discrete", tmp_path / "none.json")
 
 
 CAR = compose_option("car", "deepracer", CarConfig)
@@ -237,8 +235,7 @@ def test_ranges_beyond_the_cars_are_named_with_its_own() -> None:
 def test_files_of_racers_with_actions_that_the_car_makes_equal_are_remarked_upon(
     reference: Path, file: str, words: list[str]
 ) -> None:
-    config = compose_option("action_space", "discrete", ActionSpaceConfig)
-    remarks = action_remarks(build_action_space(with_file(config, reference / "inputs" / file)), CAR)
+    remarks = action_remarks(build_action_space(of_file("discrete", reference / "inputs" / file)), CAR)
     for word in words:
         assert any(word in line for line in remarks)
 

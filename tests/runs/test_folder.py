@@ -34,7 +34,7 @@ def test_no_label_leads_out_of_the_experiments_folder(tmp_path, label):
 def test_it_is_described_by_what_composed_it(folder):
     experiment, composition = compose_experiment(["experiment=tiny", "seed=7"])
     reward = load_reward_source(experiment.reward)
-    folder.describe(composition, reward, experiment.seed, {"track": "reinvent_base"})
+    folder.describe(composition, reward, experiment, {"track": "reinvent_base"})
     again, _ = compose_experiment(yaml.safe_load((folder.path / "overrides.yaml").read_text()))
     assert again == experiment
     assert yaml.safe_load((folder.path / "config.yaml").read_text()) == composition.mapping
@@ -49,7 +49,7 @@ def test_it_is_described_by_what_composed_it(folder):
 def test_secrets_of_a_uri_are_not_written(folder):
     uri = "https://user:hunter2@example.org"
     experiment, composition = compose_experiment([f"tracking.uri='{uri}'"])
-    folder.describe(composition, load_reward_source(experiment.reward), 0, {})
+    folder.describe(composition, load_reward_source(experiment.reward), experiment, {})
     for path in folder.path.iterdir():
         assert "hunter2" not in path.read_text()
 

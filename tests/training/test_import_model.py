@@ -93,12 +93,16 @@ def zip_of(files):
     return packed.getvalue()
 
 
-def test_a_model_becomes_a_run_and_nothing_of_it_is_run(call, tmp_path, networks, weights):
+def test_a_model_becomes_a_run_and_nothing_of_it_is_run(
+    call, run_at, tmp_path, monkeypatch, networks, weights
+):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "account"))
     write_folder(tmp_path / "sent", files_of(weights))
     ended = call("import", "sent", "--name", "mine", "tracking=off", "seed=3")
     assert ended.code == 0, ended.stderr
     assert not list(tmp_path.rglob("it_was_run"))
-    assert f"deepracer-exp clone runs/{ended.folder.parent.name}/{ended.folder.name}" in ended.stdout
+    place = f"runs/{ended.folder.parent.name}/{ended.folder.name}"
+    assert f"deepracer-exp clone {place} reward.file=conf/reward/mine.py" in ended.stdout
     assert "deepracer-exp analyze sent" in ended.stdout
     run = StoredRun(ended.folder)
     experiment = run.experiment
@@ -113,6 +117,11 @@ def test_a_model_becomes_a_run_and_nothing_of_it_is_run(call, tmp_path, networks
     assert (tmp_path / "conf/reward/mine.py").read_text() == REWARD
     call("import", "sent", "--name", "mine", "tracking=off").assert_refused("exists already")
     assert len(list(tmp_path.glob("runs/mine/*"))) == 1
+    # An import does not use the reward function: in a later command it is still a stranger's.
+    run_at(tmp_path, "clone", str(ended.folder)).assert_refused(
+        "not a reward function that you have trained with"
+    )
+    assert not list(tmp_path.rglob("it_was_run"))
 
 
 SAC_METADATA = METADATA | {

@@ -14,6 +14,7 @@ from deepracer_exp.aws.models.model_metadata import (
     ModelMetadata,
     read_model_metadata,
 )
+from deepracer_exp.config.parse import action_space_values
 from deepracer_exp.errors import BadInput
 
 KEY = "custom_files"
@@ -117,20 +118,7 @@ class CustomFiles:
     @property
     def action_space(self) -> dict[str, Any]:
         """Return the values of the group `action_space`; empty without a model_metadata.json."""
-        if self.metadata is None:
-            return {}
-        low, high = self.metadata.low, self.metadata.high
-        if low is None or high is None:
-            listed = self.metadata.actions
-            actions = [
-                {"steering_angle": action.steering_deg, "speed": action.speed_mps} for action in listed
-            ]
-            return {"kind": "discrete", "actions": actions}
-        return {
-            "kind": "continuous",
-            "steering_angle": {"low": low.steering_deg, "high": high.steering_deg},
-            "speed": {"low": low.speed_mps, "high": high.speed_mps},
-        }
+        return {} if self.metadata is None else action_space_values(self.metadata)
 
     @property
     def car(self) -> str | None:

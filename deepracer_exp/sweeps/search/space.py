@@ -15,7 +15,7 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.options import groups
 from deepracer_exp.config.overrides import OPEN_MAPPINGS
 from deepracer_exp.config.own_class import allow
-from deepracer_exp.config.parse import parse_experiment
+from deepracer_exp.config.parse import parse_experiment, take_over_files
 from deepracer_exp.config.sweep import SweepRequest
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.real_car import require_car
@@ -206,6 +206,7 @@ class _Trials:
                 holder[axis.key.rpartition(".")[2]] = override_value(line)
                 if not self._stored:
                     allow(changed)
+                take_over_files(changed)
                 self._read(parse_experiment(changed))
             else:
                 self._values({**context, axis.key: line})
@@ -271,9 +272,17 @@ def _contains(wider: Choices | Range, narrower: Choices | Range) -> bool:
 
 
 def value_at(values: Mapping[str, Any], key: str) -> list[Any]:
-    """Return the value of a key in all values of an experiment; an empty list if it does not exist."""
+    """Return the value of a key in all values of an experiment; an empty list if it does not exist.
+
+    Constants of a reward function that the experiment does not set are those of its file.
+
+    Raises:
+        BadInput: the reward function cannot be read.
+    """
     holder = _holder(values, key)
-    leaf = key.rpartition(".")[2]
+    group, _, leaf = key.rpartition(".")
+    if group == _CONSTANTS and holder is not None and leaf not in holder:
+        holder = dict(load_reward_source(parse_experiment(dict(values)).reward).constants)
     return [holder[leaf]] if holder is not None and leaf in holder else []
 
 
