@@ -174,14 +174,18 @@ class Evaluator:
         won = () if rivals is None else rivals.results(protocol)
         return Evaluation(tuple(self._groups(protocol, np.stack(trace, axis=1), won)), among_others)
 
+    @property
+    def groups(self) -> dict[tuple[str, str], list[int]]:
+        """Numbers of the trials by the name of their track and their condition."""
+        rows: dict[tuple[str, str], list[int]] = {}
+        for row, trial in enumerate(self.trials):
+            rows.setdefault((self.race.setup.courses[trial.course].name, trial.condition), []).append(row)
+        return rows
+
     def _groups(
         self, protocol: RaceProtocol, trace: NDArray[np.float64], won: Sequence[float]
     ) -> list[TrialGroup]:
         zigzags = [self._zigzag(trial.course, rows) for trial, rows in zip(self.trials, trace, strict=True)]
-        names = [course.name for course in self.race.setup.courses]
-        rows: dict[tuple[str, str], list[int]] = {}
-        for row, trial in enumerate(self.trials):
-            rows.setdefault((names[trial.course], trial.condition), []).append(row)
         return [
             TrialGroup(
                 track,
@@ -191,7 +195,7 @@ class Evaluator:
                 tuple(zigzags[trial] for trial in trials),
                 tuple(won[trial] for trial in trials) if won else (),
             )
-            for (track, condition), trials in rows.items()
+            for (track, condition), trials in self.groups.items()
         ]
 
     def _zigzag(self, course: int, rows: NDArray[np.float64]) -> ZigZag:
@@ -222,8 +226,7 @@ def _courses(tracks: dict[str, TrackConfig]) -> tuple[Course, ...]:
     courses = []
     for name, config in tracks.items():
         for track in directed_tracks(config):
-            label = track.name if config.file is not None and len(tracks) == 1 else name
-            label += " reversed" * (track.reversed and config.direction == "alternate")
+            label = name + " reversed" * (track.reversed and config.direction == "alternate")
             courses.append(Course(name=label, weight=1.0, tracks=(track,)))
     return tuple(courses)
 

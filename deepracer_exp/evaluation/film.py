@@ -199,13 +199,17 @@ def best_attempt(evaluation: Evaluation, trials: Container[int] | None = None) -
     return max(attempts, key=lambda a: (a.complete, -a.time_s if a.complete else a.progress))
 
 
-def drive_best_lap(evaluator: Evaluator, policy: nn.Module) -> tuple[Lap, TensorDict]:
+def drive_best_lap(
+    evaluator: Evaluator, policy: nn.Module, trials: Container[int] | None = None
+) -> tuple[Lap, TensorDict]:
     """Drive all trials, and again to record the fastest usual lap: every drive of a policy is the same.
+
+    `trials` are those that count; None: all.
 
     Returns:
         The lap of n steps, and the policy's inputs and outputs in these, [n].
     """
-    best = best_attempt(evaluator(policy))
+    best = best_attempt(evaluator(policy), trials)
     recorder = LapRecorder(evaluator, best)
     evaluator(policy, recorder)
     return recorder.lap(best), recorder.acted

@@ -186,6 +186,13 @@ class Evaluation:
         tracks_with_lap, negative_s = self.rank("race_score")
         return -negative_s if tracks_with_lap == 1.0 else None
 
+    @property
+    def lap_time_s(self) -> float | None:
+        """Mean time of the complete usual laps, mean over tracks; None without a lap on every track."""
+        means_s = [group.mean_lap_time_s for group in self.groups if group.condition == USUAL]
+        timed_s = [mean_s for mean_s in means_s if mean_s is not None]
+        return float(np.mean(timed_s)) if len(timed_s) == len(means_s) else None
+
     def rank(self, metric: Metric) -> Rank:
         """Return the policy's rank by a metric: of usual and held-out laps together, by `reliable_lap` of usual ones.
 
@@ -258,7 +265,7 @@ def eval_columns(evaluation: Evaluation) -> dict[str, float | None]:
         "eval_lap_share": usual.lap_share,
         "eval_laps": len(usual.lap_times_s),
         "eval_laps_tried": len(usual.decided),
-        "eval_lap_time_s": usual.mean_lap_time_s,
+        "eval_lap_time_s": evaluation.lap_time_s,
         "eval_race_score_s": evaluation.race_score_s,
         **zigzag_columns(usual),
         **({"eval_crash_free": usual.crash_free_share} if evaluation.among_others else {}),

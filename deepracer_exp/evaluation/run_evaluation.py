@@ -221,7 +221,7 @@ def evaluate_run(
     out.print(f"\n  zig-zag  {evaluation.on(USUAL).zigzag.words()}, on straights", soft_wrap=True)
     out.print(f"  results  {file}", soft_wrap=True)
     if trace is not None:
-        for written in traced.write(trace, evaluator.race):
+        for written in traced.write(trace, evaluator):
             out.print(f"  trace    {written}", soft_wrap=True)
     files = {file: EVALUATIONS}
     if video is not None:
@@ -280,7 +280,7 @@ def trained_on(experiment: Experiment, config: EvaluationConfig, evaluation: Eva
     """Return the names of the tracks that the policy of an evaluation was trained on."""
     if config.tracks is None:
         return evaluation.tracks
-    # A track file replaces an option and keeps its name, so it is not the track of that name.
+    # Among several, a track of a file keeps the name of an option, so it is not the track of that name.
     return [name for name, track in experiment.tracks.items() if track.file is None]
 
 

@@ -154,10 +154,8 @@ def _chance(view: LogView, target_s: float | None) -> Finding | None:
     best_s, mean_s = float(laps_s.min()), float(laps_s.mean())
     if laps < LEAST_LAPS:
         are = f"is a complete {view.lap_word}" if laps == 1 else f"are complete {view.lap_word}s"
-        sentence = (
-            f"{laps} of {count(len(episodes), 'episode')} {when} {are}, the fastest in {best_s:.2f} s: too few to "
-            "say how likely the next one is."
-        )
+        of = "" if view.laps_only else f" of {count(len(episodes), 'episode')}"
+        sentence = f"{laps}{of} {when} {are}, the fastest in {best_s:.2f} s: too few to say how likely the next one is."
         return Finding("chance", sentence, {"laps": laps, "best_s": best_s}, {"least_laps": LEAST_LAPS})
     complete, sd_s = laps / len(episodes), float(laps_s.std(ddof=1))
     share = f"{complete:.0%} of these episodes were complete laps."

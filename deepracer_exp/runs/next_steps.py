@@ -92,6 +92,7 @@ def official_place(run: RunRecord) -> str | None:
     race = config.get("race") or {}
     others = [race.get(kind) or {} for kind in ("boxes", "bots")]
     alone = alone and not any(some.get("number") or some.get("positions") for some in others)
+    alone = alone and race.get("rivals") is None and protocol.get("race") is None
     if mean_lap_s is None or not alone or protocol.get("tracks") is not None or protocol.get("real_car"):
         return None
     observation, penalty_s = config.get("observation") or {}, protocol.get("penalty_s") or {}

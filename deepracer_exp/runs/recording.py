@@ -82,6 +82,7 @@ EVALUATION_COLUMNS: Mapping[str, tuple[str, str]] = {
 """Columns of `Recording.evaluations`: type and meaning with unit."""
 COUNTED_COLUMNS: Mapping[str, tuple[str, str]] = {
     "iteration": ("int32", "policy update that used the steps"),
+    "steps": ("int64", "control steps of the training"),
     "episodes": ("int64", "that ended in it"),
     "complete": ("int64", "episodes that completed the lap"),
     "completion_mean": ("float64", "per cent of the lap, mean over episodes; NaN where none ended"),
@@ -119,7 +120,9 @@ class RunRecording:
     usual_episodes: NDArray[np.int64] | None = None
     """Episodes on usual conditions, where only a share of the cars differed from them; None: all were alike."""
     counted: pd.DataFrame | None = None
-    """Results of all episodes by iteration, `COUNTED_COLUMNS`, where the trace has complete laps only."""
+    """All steps and episodes by iteration, `COUNTED_COLUMNS`, where the trace lacks some; None on several tracks."""
+    laps_only: bool = False
+    """Whether the trace has complete laps only."""
     others: PlacedOthers | None = None
     """The others on the road; None where the car was alone, or they are not known."""
 
@@ -190,7 +193,8 @@ def read_run_recording(folder: Path) -> RunRecording:
         decision=_decision(folder),
         randomized=is_randomized(config),
         usual_episodes=_usual_episodes(traces, config, problems),
-        counted=counted if laps_only else None,
+        counted=counted if _track(config) is not None and counted["steps"].sum() > len(steps) else None,
+        laps_only=laps_only,
         others=_others(folder, config, problems),
     )
 
@@ -310,7 +314,7 @@ def _metrics(
     """Return updates, evaluations, and the results of the episodes (`COUNTED_COLUMNS`)."""
     file = folder / METRICS
     updates, evaluated, counted = [], [], []
-    episodes = laps = 0
+    steps = episodes = laps = 0
     for number, line in enumerate(_text(file, problems, files).splitlines(), start=1):
         try:
             row = json.loads(line)
@@ -322,14 +326,15 @@ def _metrics(
             tried = {name: _number(row.get(f"eval_{name}")) for name in names}
             tried["held_out_completion"] = _number(row.get("held_out_completion"))
             ended, complete = int(row["episodes"]) - episodes, int(row["laps"]) - laps
-            episodes, laps = int(row["episodes"]), int(row["laps"])
+            driven = int(row["env_steps"]) - steps
+            steps, episodes, laps = int(row["env_steps"]), int(row["episodes"]), int(row["laps"])
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             problems.append(LogProblem(str(file), number, f"left out: {_one_line(error)}"))
             continue
         updates.append({"iteration": iteration, "epoch": 0, **losses})
         counted.append(
             {
-                **{"iteration": iteration, "episodes": ended, "complete": complete},
+                **{"iteration": iteration, "steps": driven, "episodes": ended, "complete": complete},
                 "completion_mean": _number(row.get("completion")),
                 "lap_share": complete / ended if ended else math.nan,
                 "reward_mean": _number(row.get("mean_return")),

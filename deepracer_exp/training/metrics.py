@@ -20,9 +20,8 @@ _FEWEST_EPISODES = 10  # with fewer, the mean completion says little about the p
 
 
 def track_names(setup: RaceSetup) -> list[str]:
-    """Return the names of courses: the options' names, or for a single course its own, which a file may set."""
-    courses = setup.courses
-    return [course.name for course in courses] if len(courses) > 1 else [setup.track.name]
+    """Return the names of the courses."""
+    return [course.name for course in setup.courses]
 
 
 @dataclass(frozen=True)
@@ -245,7 +244,7 @@ def _figures(finished: Finished, record: Record) -> dict[str, float | None]:
         "completion": _mean(finished.progress),
         "lap_share": record.lap_share,
         "best_lap_time_s": record.best_lap_s,
-        "mean_lap_time_s": _mean(finished.time_s[finished.lap]),
+        "mean_lap_time_s": _mean(finished.time_s[finished.lap & finished.on_usual]),
     }
 
 

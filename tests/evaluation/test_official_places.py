@@ -82,16 +82,19 @@ def test_the_report_of_a_training_names_the_place(copied, call, board_of_the_str
     )
 
 
-def test_a_run_of_several_tracks_of_the_real_car_or_without_a_lap_has_no_place(tmp_path):
+def test_a_run_of_several_tracks_among_others_of_the_real_car_or_without_a_lap_has_no_place(tmp_path):
     best = {"metric": "race_score", "rank": [1.0, -14.0], "iteration": 3, "eval_completion": 100.0}
     (tmp_path / "summary.json").write_text(json.dumps({"best": best | {"eval_lap_time_s": 14.0}}))
     albert = {"name": "Albert", "direction": "forward", "file": None, "knots": None}
 
-    def place(track: dict, **protocol: object) -> str | None:
-        return official_place(RunRecord(tmp_path, {"track": track, "evaluation": protocol}, [], {}, {}))
+    def place(track: dict, rivals: dict | None = None, **protocol: object) -> str | None:
+        config = {"track": track, "race": {"rivals": rivals}, "evaluation": protocol}
+        return official_place(RunRecord(tmp_path, config, [], {}, {}))
 
     assert "May 2024 Qualifier" in (place(albert) or "")
     assert place({"A": albert}) is None
+    assert place(albert, rivals={"policy": None}) is None
+    assert place(albert, race="head_to_head") is None
     assert place(albert, real_car={"picture": None, "timing": None, "controls": None}) is None
     assert place(albert | {"direction": "reversed"}) is None
     assert place(albert | {"file": "mine.npy"}) is None

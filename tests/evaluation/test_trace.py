@@ -29,6 +29,38 @@ def test_a_penalty_counts_down_from_the_row_in_which_it_is_given():
     assert left_s.tolist() == [0, 1.0, 0.5, 0, 0, 2.0, 1.5]
 
 
+@pytest.mark.parametrize("race", ["time_trial", "head_to_bot"])
+def test_each_lap_of_a_trial_is_an_episode_with_its_time_and_each_condition_has_a_folder(
+    circle, protocol, tmp_path, race
+):
+    overrides = [
+        f"track.file={circle}",
+        "action_space=continuous",
+        f"race={race}",
+        "race.bots.min_distance_m=1",
+        "observation.next_objects=2",
+    ]
+    experiment = compose_experiment(overrides)[0]
+    config = protocol("three_trials", trials=2, laps=2, time_s=60.0, held_out="sim2real")
+    evaluator, recorder = Evaluator(experiment, config, threads=1), TraceRecorder(config)
+    evaluation = evaluator(Driver(experiment), recorder)
+    files = recorder.write(tmp_path / "trace", evaluator)
+    for group in evaluation.groups:
+        folder = tmp_path / "trace" / group.condition
+        assert {file for file in files if folder in file.parents} == {
+            file for file in folder.rglob("*") if file.is_file()
+        }
+        view = prepare(read_log(folder))
+        laps = sorted(group.attempts, key=lambda lap: (lap.trial, lap.begin_s))
+        assert len(laps) == 4 or group.condition == "held_out" or race == "head_to_bot"
+        laps_s = [lap.time_s if lap.complete and not lap.resets else np.nan for lap in laps]
+        np.testing.assert_allclose(view.episodes["lap_time_s"], laps_s, atol=1e-3)
+        if race == "head_to_bot":
+            placed = read_log(folder).others.episodes[False]
+            trials = {lap.trial for lap in laps}
+            assert (len(placed), len({one.seed for one in placed.values()})) == (len(laps), len(trials))
+
+
 def test_the_steps_of_an_evaluation_are_written_and_every_pose_of_the_others_is_rebuilt(protocol, tmp_path):
     options = (
         "race=head_to_bot",
@@ -46,7 +78,7 @@ def test_the_steps_of_an_evaluation_are_written_and_every_pose_of_the_others_is_
         poses.append(race.others.others.poses.copy())
 
     evaluation = evaluator(Driver(experiment), record)
-    recorder.write(tmp_path / "trace", evaluator.race)
+    recorder.write(tmp_path / "trace", evaluator)
     read = read_recording(tmp_path / "trace")
     assert read.problems == ()
     steps = read.steps.sort_values(["episode", "steps"], kind="stable")

@@ -137,5 +137,5 @@ def test_a_page_of_laps_only_counts_all_episodes_and_says_nothing_of_failures(co
     fewer = dict.fromkeys(log_report.SECTIONS, ()) | {of_failures: log_report.SECTIONS[of_failures]}
     monkeypatch.setattr(log_report, "SECTIONS", fewer)
     assert of_failures not in draw_sections(LogPage(view, []))
-    everything = replace(view, run=replace(view.run, counted=None))
+    everything = replace(view, run=replace(view.run, laps_only=False))
     assert of_failures in draw_sections(LogPage(everything, []))

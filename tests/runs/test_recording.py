@@ -10,11 +10,14 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 
+from deepracer_exp.aws.logs import sim_trace
 from deepracer_exp.aws.logs.recorded import METRICS_COLUMNS, STEP_COLUMNS, UPDATE_COLUMNS
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.env.trace_columns import SCHEMA
 from deepracer_exp.errors import BadInput
+from deepracer_exp.reports.tables.log_tables import headline
+from deepracer_exp.reports.tables.log_view import prepare
 from deepracer_exp.runs.recording import EVALUATION_COLUMNS, is_traced_run, read_run_recording
 from deepracer_exp.runs.trace import read_trace
 
@@ -109,6 +112,17 @@ def test_a_file_of_the_trace_that_cannot_be_read_is_left_out_and_reported(folder
     assert problem.file == str(file)
     assert problem.reason.startswith("left out: ")
     assert file not in recording.files
+
+
+def test_what_a_trace_lacks_is_counted_by_the_metrics(folder, monkeypatch):
+    whole = prepare(read_run_recording(folder))
+    assert whole.run.counted is None
+    monkeypatch.setattr(sim_trace, "MOST_STEPS", 1100)
+    view = prepare(read_run_recording(folder))
+    assert len(view.steps) == 1024
+    for name in ("iteration", "steps", "episodes", "complete"):
+        assert view.iterations[name].tolist() == whole.iterations[name].tolist(), name
+    assert headline(view).startswith("4,096 control steps of training in ")
 
 
 def test_episodes_on_usual_conditions_are_known_where_only_a_share_of_the_cars_differs(folder):

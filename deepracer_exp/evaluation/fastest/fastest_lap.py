@@ -138,7 +138,7 @@ class Question:
             RunFailed: no lap is possible within the limits.
         """
         car, track = self.experiment.car, self.track
-        bound_s, line = self.bound()
+        bound_s, line = self._bound()
         places = np.linspace(0.0, 1.0, round(track.length_m / _LINE_M))
         search = Search(car, track, *self._limits)
         commands = search.run((track.points_at(places), line), on_round)
@@ -146,14 +146,14 @@ class Question:
         ahead = car.front_point_m * np.column_stack([np.cos(steps[:, 3]), np.sin(steps[:, 3])])
         time_s = float(steps[-1, 0])
         # The search for the line of the bound is local, too.
-        bound_s = min(bound_s, self.bound(steps[1:, 1:3] - ahead[1:])[0], time_s)
+        bound_s = min(bound_s, self._bound(steps[1:, 1:3] - ahead[1:])[0], time_s)
         return FastestLap(lap_time_s=time_s, bound_s=bound_s, steps=steps)
 
     @cached_property
     def _ability(self) -> Ability:
         return ability_of(self.experiment.car, *self._limits, self.track.floor.friction)
 
-    def bound(self, driven: Floats | None = None) -> tuple[float, Floats]:
+    def _bound(self, driven: Floats | None = None) -> tuple[float, Floats]:
         """Return the bound from below of the lap time in s, and its line, (n, 2).
 
         `driven` are chassis origins of a lap (n, 2), from whose line the search for the least time begins, in place of

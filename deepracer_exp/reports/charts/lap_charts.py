@@ -117,7 +117,7 @@ def lap_time_percentile(view: LogView) -> Chart | None:
     table = view.judged[view.judged["lap_time_p25_s"].notna()]
     if not len(table):
         return None
-    laps = view.episodes[view.episodes["lap_time_s"].notna()]
+    laps = view.comparable[view.comparable["lap_time_s"].notna()]
     shown = laps.iloc[subsample(len(laps), 2500)]
     x, y, share = table["iteration"], table["lap_time_p25_s"], 100 * table["lap_share"]
     best = table[table["iteration"].isin(view.candidates["iteration"])]

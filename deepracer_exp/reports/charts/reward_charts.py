@@ -245,7 +245,7 @@ def common_rewards(view: LogView) -> Chart | None:
 def scatter_time_reward(view: LogView) -> Chart | None:
     """Draw reward, progress, time and steps of each episode against each other."""
     episodes = view.episodes[view.episodes["ended"]]
-    if len(episodes) < 2:
+    if view.laps_only or len(episodes) < 2:
         return None
     shown = episodes.iloc[subsample(len(episodes), _MOST_EPISODES)]
     panels = []
@@ -263,7 +263,7 @@ def scatter_time_reward(view: LogView) -> Chart | None:
         ]
         if layers:
             panels.append(Panel(x_label=x_label, y_label=y_label, layers=layers))
-    r = episodes["lap_time_s"].corr(episodes["reward"], min_periods=3)
+    r = view.comparable["lap_time_s"].corr(view.comparable["reward"], min_periods=3)
     words = (
         f"Lap time and reward of complete laps correlate with r = {r:+.2f}: below zero, the reward asks for speed."
         if np.isfinite(r)

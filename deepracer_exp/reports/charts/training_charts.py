@@ -113,7 +113,7 @@ def learning_vs_lap_time(view: LogView) -> Chart | None:
 def quarters(view: LogView) -> Chart | None:
     """Draw progress, complete laps, reward and lap times of each quarter of the episodes."""
     episodes = view.episodes[view.episodes["ended"]]
-    if len(episodes) < 4:
+    if view.laps_only or len(episodes) < 4:
         return None
     groups = episodes.groupby("quarter")
     places = np.array(list(groups.groups)) - 1
@@ -123,15 +123,16 @@ def quarters(view: LogView) -> Chart | None:
         ("Complete laps", "per cent of the episodes", [bars(places, 100 * groups["complete"].mean(), GREEN)]),
         ("Reward, mean", "reward of an episode", [bars(places, groups["reward"].mean(), SKY)]),
     ]
-    laps = episodes[episodes["lap_time_s"].notna()]
+    laps = view.comparable[view.comparable["lap_time_s"].notna()]
     if len(laps):
+        lap_s = laps.groupby("quarter")["lap_time_s"].agg(["mean", "min"]).reindex(places + 1)
         laps = laps.iloc[subsample(len(laps), 2000)]
         # Within a quarter from left to right in the order of driving.
         within = laps.groupby("quarter").cumcount() / laps.groupby("quarter")["quarter"].transform("size")
         times: list[Layer] = [
             points(laps["quarter"] - 1 + 0.7 * (within - 0.5), laps["lap_time_s"], SKY, size=5),
-            points(places, groups["lap_time_s"].mean(), BLUE, "mean", size=11, symbol="diamond"),
-            points(places, groups["lap_time_s"].min(), VERMILION, "best", size=12, symbol="star"),
+            points(places, lap_s["mean"], BLUE, "mean", size=11, symbol="diamond"),
+            points(places, lap_s["min"], VERMILION, "best", size=12, symbol="star"),
         ]
         shown.append(("Lap times, in their order", "lap time, s", times))
     axis: dict[str, Any] = {
@@ -237,7 +238,7 @@ def stability(view: LogView) -> Chart | None:
             y_range=(0.0, max(1.15 * _TOO_LONG_MS, 1.05 * float(np.nanmax(high)))),
         ),
     ]
-    episodes = view.episodes[view.episodes["ended"]]
+    episodes = view.episodes[view.episodes["ended"] & (not view.laps_only)]
     for column, title, unit, color in (
         ("progress", "Progress of the episodes", "per cent of the lap", BLUE),
         ("reward", "Reward of the episodes", "reward of an episode", GREEN),
@@ -314,9 +315,11 @@ def curves_so_far(rows: Sequence[Mapping[str, Any]]) -> Chart:
     for title, (unit, curves) in _CURVES.items():
         layers: list[Layer] = []
         for column, (name, color) in curves.items():
-            columns = [key for key in table if key == column or key.startswith(f"{column}/")]
-            # Not every iteration ends an episode on every track, or is evaluated.
-            values = table[columns].astype(float).mean(axis=1).to_numpy()
+            columns = [key for key in table if key.startswith(f"{column}/")] or [column]
+            by_track = table.reindex(columns=columns).astype(float)
+            # Not every iteration ends an episode on every track.
+            by_track = by_track if column.startswith("eval_") else by_track.ffill()
+            values = by_track.mean(axis=1, skipna=False).to_numpy()
             finite = np.isfinite(values)
             if finite.any():
                 layers.append(line(steps[finite], values[finite], color, name))

@@ -6,8 +6,9 @@ from pathlib import Path
 from deepracer_exp.aws.logs.recorded import LogProblem
 from deepracer_exp.config.own_class import OF_POLICY, named_again
 from deepracer_exp.errors import BadInput, RunFailed
-from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.evaluation.evaluator import evaluator_against
 from deepracer_exp.evaluation.film import Lap, LapRecorder, best_attempt, drive_best_lap
+from deepracer_exp.evaluation.rival_run import kept_rival
 from deepracer_exp.reports.charts.driving_line import EvaluatedLap
 from deepracer_exp.reports.tables.log_view import LogView
 from deepracer_exp.runs.checkpoint_files import checkpoint_words, kept_checkpoints
@@ -52,27 +53,36 @@ def drive_best(view: LogView, folder: Path, just_trained: bool = False) -> tuple
         policy, camera = stored.networks.policy, experiment.observation.camera
         protocol = replace(experiment.evaluation, held_out=None)
         if camera is not None:
-            evaluator = Evaluator(experiment, replace(protocol, trials=1, laps=1))
-            lap, acted = drive_best_lap(evaluator, policy)
-            strip = glimpses(lap, acted, policy, evaluator.race.setup.actions, camera)
-            return view, BestDrive(_shown(lap, stored.path.name), tuple(strip))
-        evaluator = Evaluator(experiment, protocol)
-        recorder = LapRecorder(evaluator)
-        evaluation = evaluator(policy, recorder)
-        names = [course.name for course in evaluator.race.setup.courses]
+            protocol = replace(protocol, trials=1, laps=1)
+        evaluator = evaluator_against(kept_rival(experiment, folder), experiment, protocol)
+        courses = evaluator.race.setup.courses
         here = {
-            number for number, trial in enumerate(evaluator.trials) if names[trial.course] == view.track_name
+            number
+            for number, trial in enumerate(evaluator.trials)
+            if courses[trial.course].name == view.track_name
         }
-        return view, BestDrive(_shown(recorder.lap(best_attempt(evaluation, here or None)), stored.path.name))
+        if camera is not None:
+            lap, acted = drive_best_lap(evaluator, policy, here or None)
+            strip = glimpses(lap, acted, policy, evaluator.race.setup.actions, camera)
+            shown = _shown(lap, stored.path.name, "An evaluated lap") if here else None
+            return view, BestDrive(shown, tuple(strip))
+        if not here:  # evaluated on other tracks
+            return view, BestDrive()
+        recorder = LapRecorder(evaluator)
+        best = best_attempt(evaluator(policy, recorder), here)
+        return view, BestDrive(_shown(recorder.lap(best), stored.path.name, "The fastest evaluated lap"))
     except (BadInput, RunFailed) as error:
         return replace(view, problems=(*view.problems, LogProblem(view.name, None, str(error)))), BestDrive()
 
 
-def _shown(lap: Lap, checkpoint: str) -> EvaluatedLap:
-    """Return a lap of a checkpoint for its picture; in the prepare step the car stands."""
+def _shown(lap: Lap, checkpoint: str, what: str) -> EvaluatedLap:
+    """Return a lap of a checkpoint for its picture; in the prepare step the car stands.
+
+    `what` names a complete lap.
+    """
     attempt = lap.attempt
     words = (
-        f"The fastest evaluated lap: {attempt.time_s:.2f} s"
+        f"{what}: {attempt.time_s:.2f} s"
         if attempt.complete
         else f"Evaluated, it comes {attempt.progress:.0f}% of the way"
     )

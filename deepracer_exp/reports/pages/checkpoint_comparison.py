@@ -68,7 +68,7 @@ class LapStatistics:
     median_s: float
     best_s: float
     laps_s: tuple[float, ...]
-    """Times of all complete laps on the usual conditions, in the order of the trials."""
+    """Times of all complete laps on the usual conditions, in the order of the trials; none on several tracks."""
     held_out_complete: float
     held_out_completion: float
     held_out_lap_time_s: float
@@ -147,7 +147,7 @@ def lap_statistics(evaluation: Evaluation, metric: Metric) -> LapStatistics:
         lap_time_s=time_s(25),
         median_s=time_s(50),
         best_s=time_s(0),
-        laps_s=tuple(usual.lap_times_s.tolist()),
+        laps_s=tuple(usual.lap_times_s.tolist()) if len(evaluation.tracks) == 1 else (),
         held_out_complete=math.nan if held_out is None else 100 * held_out.lap_share,
         held_out_completion=math.nan if held_out is None else held_out.completion,
         held_out_lap_time_s=time_s(25, HELD_OUT),

@@ -30,8 +30,8 @@ def laps_to_replay(
 ) -> list[ReplayedLap]:
     """Race a run's checkpoint under the usual conditions and return its fastest lap, or the one with most progress.
 
-    The lap is one of those that began where `beside` did, if there are any. `ordinary` adds the median of the other
-    complete laps, of those from the same start if there are any.
+    The lap is one of those on the track of `beside` that began where it did, if there are any. `ordinary` adds the
+    median of the other complete laps on the track, of those from the same start if there are any.
 
     Raises:
         BadInput: the checkpoint, a track or a condition cannot be used, or there is no other complete lap.
@@ -39,12 +39,21 @@ def laps_to_replay(
     """
     stored, evaluator, recorder, evaluation = _raced(run, protocol)
     starts = np.array([trial.start_ndist for trial in evaluator.trials])
-    same = np.ones(len(starts), bool) if beside is None else is_same_start(starts, beside)
-    best = best_attempt(evaluation, {*np.flatnonzero(same if same.any() else ~same).tolist()})
+    course = np.array([trial.course for trial in evaluator.trials])
+    here = np.ones(len(starts), bool)
+    if beside is not None:
+        tracks = [course.tracks[0] for course in evaluator.race.setup.courses]
+        here = np.array([replace(beside, track=track).fits for track in tracks])[course]
+        here = here if here.any() else ~here
+        same = here & is_same_start(starts, beside)
+        here = same if same.any() else here
+    best = best_attempt(evaluation, {*np.flatnonzero(here).tolist()})
     chosen = [(best, "the fastest" if best.complete else "the farthest")]
     if ordinary:
         others = [
-            attempt for attempt in evaluation.on(USUAL).attempts if attempt.complete and attempt is not best
+            attempt
+            for attempt in evaluation.on(USUAL).attempts
+            if attempt.complete and attempt is not best and course[attempt.trial] == course[best.trial]
         ]
         if not others:
             laps = count(int(best.complete), "complete lap")

@@ -28,8 +28,11 @@ class RunReport(Callback):
     """Draws the pictures of a run, and writes its report once it is over: a callback of the training."""
 
     def on_train_end(self, trainer: Trainer) -> None:
-        """Draw best_lap.png and learning.png."""
-        write_pictures(trainer.folder.path, trainer.setup.courses, trainer.metrics.on_usual)
+        """Draw best_lap.png and learning.png; no error here ends a training."""
+        try:
+            write_pictures(trainer.folder.path, trainer.setup.courses, trainer.metrics.on_usual)
+        except Exception as error:
+            logger.warning("%s and %s could not be drawn: %r", BEST_LAP, LEARNING, error, exc_info=True)
 
     def on_run_end(self, trainer: Trainer, result: TrainResult) -> None:
         """Write report.html if `report` is on and the run is over, with at least one iteration."""

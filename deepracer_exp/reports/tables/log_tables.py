@@ -216,7 +216,7 @@ def headline(view: LogView) -> str:
     """Return one sentence on the amount and quality of driving, without episodes cut off by the end of the log."""
     finished, steps = (
         count(int(view.episodes["ended"].sum()), "finished episode"),
-        count(len(view.steps), "control step"),
+        count(int(view.iterations["steps"].sum()) if view.trained else len(view.steps), "control step"),
     )
     complete, put_back = view.episodes["complete"], view.episodes["resets"] > 0
     laps, best_s = int((complete & ~put_back).sum()), view.comparable["lap_time_s"].min()

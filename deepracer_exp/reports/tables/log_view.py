@@ -116,7 +116,7 @@ class LogView:
     @property
     def laps_only(self) -> bool:
         """Whether the steps are those of complete laps only, so that the ends of other episodes are not known."""
-        return self.run is not None and self.run.counted is not None
+        return self.run is not None and self.run.laps_only
 
     @property
     def run_folder(self) -> Path | None:
@@ -240,18 +240,12 @@ class LogView:
     @cached_property
     def on_usual(self) -> NDArray[np.bool_]:
         """Whether each of `episodes` was driven on usual conditions; all where no car differs, or all do."""
-        usual = None if self.run is None or not self.trained else self.run.usual_episodes
-        everywhere = np.ones(len(self.episodes), bool)
-        if usual is None:
-            return everywhere
-        on_usual = np.isin(self.episodes["episode"].to_numpy(), usual)
-        return on_usual if on_usual.any() else everywhere
+        return _on_usual(self.episodes, self.run if self.trained else None)
 
     @cached_property
     def comparable(self) -> pd.DataFrame:
         """Episodes whose laps compare: those `on_usual`, or all where none of these is a lap."""
-        alike = self.episodes[self.on_usual]
-        return alike if alike["lap_time_s"].notna().any() else self.episodes
+        return self.episodes[_comparable(self.episodes, self.on_usual)]
 
     def of_episodes(self, wanted: NDArray[np.bool_], *columns: str) -> pd.DataFrame:
         """Return columns of the driven rows of the wanted episodes, (n,) in the order of `episodes`."""
@@ -283,6 +277,21 @@ class LogView:
     def _taken(self, rows: NDArray[np.intp], columns: Sequence[str]) -> pd.DataFrame:
         # Column by column: a frame of all columns would take seconds on millions of rows.
         return pd.DataFrame({name: self.steps[name].to_numpy()[rows] for name in columns}, copy=False)
+
+
+def _on_usual(episodes: pd.DataFrame, run: RunRecording | None) -> NDArray[np.bool_]:
+    """Return whether each episode was driven on usual conditions; all where no car differs, or all do."""
+    everywhere = np.ones(len(episodes), bool)
+    if run is None or run.usual_episodes is None:
+        return everywhere
+    on_usual = np.isin(episodes["episode"].to_numpy(), run.usual_episodes)
+    return on_usual if on_usual.any() else everywhere
+
+
+def _comparable(episodes: pd.DataFrame, on_usual: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return whether each episode's lap compares: those on usual conditions, or all where none of these is a lap."""
+    has_lap = episodes["lap_time_s"].notna().to_numpy()
+    return on_usual if (has_lap & on_usual).any() else np.ones(len(episodes), bool)
 
 
 def thirds(iteration: NDArray[np.integer]) -> NDArray[np.intp]:
@@ -341,7 +350,9 @@ def prepare(log: Recording | RunRecording | EvaluationRecording, track: str | No
     driven, raced, races_timed = _episodes(recording, here & ~training, course, discount)
     raced = raced.assign(stream=driven["stream"].to_numpy()[first_rows(driven)])
     evaluations = None if run is None else run.evaluations
-    iterations = judged = iteration_table(recording, trained, episodes, evaluations=evaluations)
+    alike = _comparable(episodes, _on_usual(episodes, run))
+    timed_alike = episodes.assign(lap_time_s=episodes["lap_time_s"].where(alike))
+    iterations = judged = iteration_table(recording, trained, timed_alike, evaluations=evaluations)
     if run is not None and run.counted is not None:
         counted = run.counted.set_index("iteration").reindex(iterations["iteration"])
         iterations = judged = iterations.assign(**{name: counted[name].to_numpy() for name in counted})

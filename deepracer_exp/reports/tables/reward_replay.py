@@ -213,8 +213,8 @@ def _laps(steps: pd.DataFrame, episode: NDArray[np.int64], view: LogView) -> pd.
 
 
 def _lap_times(view: LogView) -> pd.DataFrame:
-    """Return `stream`, `episode` and `lap_time_s` of all episodes of a view."""
-    training = [view.episodes.assign(stream=TRAINING)] if view.trained else []
+    """Return `stream`, `episode` and `lap_time_s` of the episodes of a view whose laps compare."""
+    training = [view.comparable.assign(stream=TRAINING)] if view.trained else []
     both = pd.concat([*training, view.evaluation_episodes])[["stream", "episode", "lap_time_s"]]
     return both.astype({"stream": str})
 

@@ -43,7 +43,7 @@ ITERATION_COLUMNS: Mapping[str, str] = {
     "completion_mean": "per cent of the lap, mean over episodes",
     "lap_share": "share of episodes that completed the lap, 0 to 1",
     "reward_mean": "mean of the episodes' sums",
-    "lap_time_mean_s": "s, of complete laps; NaN without one; likewise the next two",
+    "lap_time_mean_s": "s, of complete laps that compare; NaN without one; likewise the next two",
     "lap_time_best_s": "s",
     "lap_time_p25_s": "s, 25th percentile",
     "speed_mps": "m/s commanded, mean over episodes",
@@ -216,7 +216,7 @@ def _evaluated(recording: Recording, evaluations: pd.DataFrame | None) -> pd.Dat
     """
     if evaluations is not None and len(evaluations):
         means = evaluations.groupby("iteration").last()
-        if recording.track is None:  # a mean over whichever tracks have a lap
+        if recording.track is None:  # a mean over several tracks
             means["lap_time_s"] = np.nan
         names = ("completion", "lap_share", "lap_time_s", "zigzag_per_m")
         return means.rename(columns={name: f"eval_{name}" for name in names})

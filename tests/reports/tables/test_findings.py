@@ -372,7 +372,11 @@ def test_lap_times_of_cars_that_differ_are_not_compared() -> None:
     assert charts["lap_time_histogram"].rows[0][0].title == "All complete laps on usual conditions (18)"
     lost = sectors_now(view, COURSE)[1].sum(axis=1)
     assert (lost.min(), lost.max()) == pytest.approx([Drive(speed_mps=v).lap_time_s() for v in (3.2, 3.0)])
+    usual_s = [Drive(speed_mps=v).lap_time_s() for v in (3.0, 3.2)]
+    assert view.iterations["lap_time_best_s"].tolist() == pytest.approx([min(usual_s)] * 9)
+    assert view.iterations["lap_time_mean_s"].tolist() == pytest.approx([sum(usual_s) / 2] * 9)
     # Episodes on other conditions count in all that does not compare lap times.
+    assert view.iterations["complete"].tolist() == [4] * 9
     assert len(view.now()[0]) == 12
     for few, comparable in ((usual[:1], 1), (usual[:0], len(drives))):
         assert len(prepare(run_of(alike, usual_episodes=few)).comparable) == comparable
