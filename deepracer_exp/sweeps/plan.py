@@ -1,9 +1,9 @@
 """The plan of a sweep: request, study and files, resolved before PyTorch is imported."""
 
+import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deepracer_exp.config.compose import compose_experiment
@@ -90,8 +90,10 @@ def _with_lap_actions(request: SweepRequest) -> tuple[SweepRequest, LapActions |
     if len(experiment.tracks) > 1:
         raise BadInput(what, f"{len(experiment.tracks)} tracks", "one track, or sweep.lap_actions=[]")
     ((_, track),) = experiment.tracks.items()
-    parts = [track.name if track.file is None else Path(track.file).stem, composition.choices["car"]]
+    parts = [track.name, composition.choices["car"]]
     parts = [part for part in (*parts, track.direction) if part not in _USUAL]
+    if further := sorted(line for line in lines if key_of(line) not in ("track", "car", "track.direction")):
+        parts.append(hashlib.sha256("\0".join(further).encode()).hexdigest()[:6])
     place = re.sub(r"[^A-Za-z0-9_]+", "-", "-".join(parts))
     counts = {f"lap{number}-{place}": number for number in sweep.lap_actions}
     options = dimension(_ACTIONS, searched)

@@ -13,7 +13,7 @@ from typing import Any
 import optuna
 from optuna.storages import RDBStorage
 from optuna.study import Study
-from optuna.trial import FrozenTrial
+from optuna.trial import FrozenTrial, TrialState
 from rich.console import Console
 
 from deepracer_exp.config import acting
@@ -25,7 +25,7 @@ from deepracer_exp.config.stored import with_overrides
 from deepracer_exp.config.sweep import SweepConfig, SweepRequest
 from deepracer_exp.env.real_car import require_car
 from deepracer_exp.env.setup import build_setup
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import BadInput, count
 from deepracer_exp.rewards.reward import RewardFunction
 from deepracer_exp.runs.lineage import refuse_other_networks
 from deepracer_exp.sweeps.queue.study import enqueue, known_settings
@@ -50,10 +50,10 @@ from .queue.claims import Claim, TrialClaims, report_results
 from .queue.driver import Driver
 from .queue.launcher import LocalLauncher
 from .queue.ray_launcher import RayLauncher
-from .queue.storage import open_storage, patiently, resolve_database
+from .queue.storage import answering, open_storage, patiently, resolve_database
 from .queue.study import open_study
 from .queue.worker_config import RUN_ID, Parent, WorkerConfig, plan_trial
-from .report.last_race import LAST_RACE, write_submitted
+from .report.last_race import LAST_RACE, last_race, write_submitted
 from .report.view import SweepView
 from .search.pruners import build_pruner
 from .search.samplers import build_sampler
@@ -108,6 +108,13 @@ def sweep(plan: SweepPlan, console: Console) -> tuple[Study, Path, int]:
         with resolve_database(config.storage, runs_dir).creation_lock(storage.engine):
             study = open_study(request, overrides, space, parent, storage, runs_dir)
             enqueue(study, settings)
+        waiting = study.get_trials(deepcopy=False, states=(TrialState.WAITING,))
+        if waiting and waiting[-1].number >= config.trials:
+            _log.warning(
+                "sweep.enqueue: %s wait; sweep.trials=%d drives them",
+                count(sum(trial.number >= config.trials for trial in waiting), "setting"),
+                waiting[-1].number + 1,
+            )
         acting.remember()
         # Only parent runs of a trial's seeds need it; the id of an earlier start may belong to another store.
         waits = config.seeds > 1 or RUN_ID in study.user_attrs
@@ -198,7 +205,11 @@ def _run(
         if study_run is not None:
             study_run.update(progress_of(now, worker_config.config, study))
 
-    with Interruption() as interruption, SweepView(worker_config, launcher.workers, console) as view:
+    with (
+        Interruption() as interruption,
+        SweepView(worker_config, launcher.workers, console) as view,
+        answering(),
+    ):
 
         def show(now: Sequence[Claim], stage: str = "") -> None:
             if study_run is not None and study_run.has_new_id():
@@ -206,7 +217,7 @@ def _run(
             view.show(now, stage)
 
         show(patiently(claims.all, patience_s))
-        if not claims.is_done(worker_config.config.trials):
+        if not patiently(partial(claims.is_done, worker_config.config.trials), patience_s):
             code = Driver(worker_config, storage, launcher, show, track).run(interruption)
             if code is not None:
                 return code
@@ -283,9 +294,11 @@ def _conclude(
         view.show(claims.all())
     else:
         study.set_user_attr("reranked", [])
-    study.set_user_attr(LAST_RACE, None)
-    if complete_trials(study):
-        write_best(study, runs_dir)
+    # If this is interrupted, the run to submit stays that of the last race.
+    if config.clone is None or last_race(study) is None:
+        study.set_user_attr(LAST_RACE, None)
+        if complete_trials(study):
+            write_best(study, runs_dir)
     write_study_page(study, page)
     if complete_trials(study) and config.clone is not None:
         from .last_stage import LastStage

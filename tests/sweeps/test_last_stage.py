@@ -1,16 +1,21 @@
 """The last stage of `deepracer-exp sweep`: the best trial is cloned, and the clone races."""
 
 import json
+import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 
+from deepracer_exp.config.sweep import compose_sweep
 from deepracer_exp.runs.lineage import read_lineage
 from deepracer_exp.runs.run_files import read_config, read_object
 from deepracer_exp.sweeps.last_stage import LastStage
+from deepracer_exp.sweeps.queue.study import known_settings
 from deepracer_exp.sweeps.report.best_trial import best_run, best_trial
-from deepracer_exp.sweeps.report.last_race import last_race
+from deepracer_exp.sweeps.report.last_race import last_race, store_last_race, write_submitted
+from deepracer_exp.sweeps.search.space import SearchSpace
 from deepracer_exp.sweeps.trial import Interrupted
 from deepracer_exp.tracking.resolve import resolve
 
@@ -52,6 +57,14 @@ def test_the_clone_is_a_run_of_its_own_whose_parent_is_the_best_trial(cloned):
     }
 
 
+def test_another_sweep_begins_with_the_settings_of_the_clones_trial(cloned):
+    (clone,) = (cloned.cwd / "runs" / "s").glob("*-clone1")
+    request = compose_sweep(["study=t", LR, f"sweep.enqueue=[{clone}]"])
+    assert known_settings(request, SearchSpace.from_request(request)) == [
+        best_trial(load(cloned.cwd, "s")).params
+    ]
+
+
 def test_the_clone_the_best_and_the_second_best_trial_race_and_the_best_of_them_is_the_runs_name(cloned):
     study = load(cloned.cwd, "s")
     race = last_race(study)
@@ -68,6 +81,27 @@ def test_the_clone_the_best_and_the_second_best_trial_race_and_the_best_of_them_
     assert "What to submit, and why" in (cloned.cwd / "runs" / "s" / "sweep.html").read_text()
 
 
+def test_the_run_to_submit_stays_where_a_repeated_sweep_is_interrupted(
+    cloned, call_at, tmp_path, monkeypatch
+):
+    shutil.copytree(cloned.cwd / "runs", tmp_path / "runs", symlinks=True)
+    page, best = (tmp_path / "runs" / "s" / name for name in ("sweep.html", "best_of_sweep.json"))
+    # Whichever of the two won in these few steps: the run to submit is the clone.
+    race = last_race(load(tmp_path, "s"))
+    clone = next(racer for racer in race.racers if racer.is_clone)
+    store_last_race(load(tmp_path, "s"), replace(race, racers=(clone, *race.racers)))
+    write_submitted(load(tmp_path, "s"), tmp_path / "runs", last_race(load(tmp_path, "s")))
+
+    def interrupted(self):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(LastStage, "run", interrupted)
+    assert call_at(tmp_path, "sweep", "study=s").code == 130
+    assert json.loads(best.read_text())["run_dir"] == clone.run
+    assert "What to submit, and why" in page.read_text()
+
+
+@pytest.mark.processes
 def test_a_sweep_waits_for_another_one_in_the_last_stage_of_the_study_and_ctrl_c_ends_the_wait(tmp_path):
     shown: list[str] = []
 

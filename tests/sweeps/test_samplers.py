@@ -161,6 +161,8 @@ def test_the_grid_visits_each_point_once_and_two_workers_share_it():
 def test_more_trials_than_a_grid_has_points_are_refused():
     with pytest.raises(BadInput, match=r"^sweep\.trials=7: the grid has 6 points.*accepted: 1 to 6$"):
         build_sampler(settings("grid", trials=7), Choices())
+    with pytest.raises(BadInput, match=r"^sweep\.enqueue: the grid drives each of its points anyway"):
+        build_sampler(settings("grid", enqueue=("best:other",)), Choices())
 
 
 @pytest.mark.filterwarnings("error")

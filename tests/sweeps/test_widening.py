@@ -1,5 +1,7 @@
 """A study is given a wider search, and settings to begin with, in real databases and without trainings."""
 
+from types import SimpleNamespace
+
 import optuna
 import pytest
 from optuna.distributions import CategoricalDistribution
@@ -7,9 +9,17 @@ from optuna.trial import TrialState
 
 from deepracer_exp.config.compose import compose_evaluation
 from deepracer_exp.config.sweep import compose_sweep
+from deepracer_exp.rewards.source import load_reward_source
+from deepracer_exp.runs.stored_run import StoredRun
 from deepracer_exp.sweeps.queue.claims import TrialClaims
 from deepracer_exp.sweeps.queue.storage import open_storage
-from deepracer_exp.sweeps.queue.study import complete_widening, enqueue, known_settings, open_study
+from deepracer_exp.sweeps.queue.study import (
+    complete_widening,
+    enqueue,
+    known_settings,
+    open_study,
+    with_stored,
+)
 from deepracer_exp.sweeps.queue.trial_run import TrialRun
 from deepracer_exp.sweeps.queue.worker import Worker
 from deepracer_exp.sweeps.queue.worker_config import WorkerConfig
@@ -127,7 +137,7 @@ def test_a_search_that_leaves_something_out_or_changes_every_trial_is_refused(ma
 def test_a_study_with_a_running_trial_is_not_widened(started, storage):
     started(LR, NETWORK, "sweep.trials=2")
     claims = TrialClaims(storage.engine, "s")
-    assert claims.claim("elsewhere:1:b", 2, 60.0)
+    assert claims.claim("elsewhere:1:b", 2, 3600.0)
     assert "trial 0 is running" in refused(started, LR, "network=mlp_small,mlp,mlp_deep", "sweep.trials=2")
     claims.release("elsewhere:1:b")
     assert started(LR, "network=mlp_small,mlp,mlp_deep", "sweep.trials=2")
@@ -183,6 +193,101 @@ def test_a_run_gives_its_values_of_the_searched_keys(made, trained, tmp_path):
     run = trained("algorithm.lr=4e-4").folder
     (first, *_) = made(LR, NETWORK, f"sweep.enqueue=[{run}]", "sweep.trials=1")
     assert first.params["algorithm.lr"] == 4e-4
+
+
+@in_a_file
+def test_a_study_that_was_deleted_begins_again_with_its_first_trial(made, storage):
+    made(LR, "sweep.trials=2")
+    optuna.delete_study(study_name="s", storage=storage)
+    again = made(LR, "sweep.trials=3")
+    assert [(trial.number, trial.state) for trial in again] == [
+        (number, TrialState.COMPLETE) for number in range(3)
+    ]
+
+
+@in_a_file
+def test_two_workers_that_draw_the_same_together_train_it_with_two_seeds(started, storage, monkeypatch):
+    study, worker = started(NETWORK, "sweep.trials=2")
+    lease = SimpleNamespace(claim=SimpleNamespace(trial=SimpleNamespace(runs=())), confirm=lambda: None)
+    first, second = (
+        TrialRun(worker._config, None, lease, study, storage, storage.create_new_trial(study._study_id), None)
+        for _ in range(2)
+    )
+    decided = []
+
+    def suggest(space, trial):
+        if trial.number == 0:  # the other worker draws and decides before this one does
+            decided.append(second._overrides())
+        return ["network=mlp"]
+
+    monkeypatch.setattr(SearchSpace, "suggest", suggest)
+    decided.append(first._overrides())
+    assert decided == [["network=mlp"], ["network=mlp", "seed=1"]]
+
+
+@in_a_file
+def test_a_setting_that_no_worker_had_begun_runs_once_it_is_begun(started, storage, monkeypatch):
+    study, worker = started(LR, "sweep.trials=1")
+    look_up = storage.get_trial_id_from_study_id_trial_number
+
+    def enqueued_meanwhile(study_id, number):
+        monkeypatch.setattr(storage, "get_trial_id_from_study_id_trial_number", look_up)
+        study.enqueue_trial({"algorithm.lr": 2e-4})
+        raise KeyError
+
+    monkeypatch.setattr(storage, "get_trial_id_from_study_id_trial_number", enqueued_meanwhile)
+    trial_id = worker._trial_id(0)
+    assert storage.get_trial(trial_id).state == TrialState.RUNNING
+
+
+@in_a_file
+def test_a_study_keeps_the_options_that_its_glob_found(started):
+    study, _ = started("lr_schedule=glob(co*)")
+    assert "lr_schedule=choice(constant,cosine)" in study.user_attrs["overrides"]
+
+
+@in_a_file
+def test_a_grid_is_not_widened(started):
+    started(NETWORK, "sweep.sampler=grid", "sweep.trials=2")
+    message = refused(started, "network=mlp_small,mlp,mlp_deep", "sweep.sampler=grid", "sweep.trials=3")
+    assert "sweep.sampler=grid drives the points of the search that it began with" in message
+
+
+@in_a_file
+def test_constants_that_a_run_leaves_as_they_are_are_those_of_its_reward_function(made, trained):
+    run, constant = trained().folder, "reward.constants.PROGRESS_WEIGHT"
+    written = load_reward_source(StoredRun(run).experiment.reward).constants
+    (first,) = made(f"{constant}=interval(0.01,100)", f"sweep.enqueue=[{run}]", "sweep.trials=1")
+    assert first.params == {constant: written["PROGRESS_WEIGHT"]}
+
+
+def test_a_study_that_its_file_names_is_found_again(tmp_path):
+    overrides = ["sweep=lr_entropy", "tracking=off", f"runs_dir={tmp_path}"]
+    request, storage = compose_sweep(overrides), open_storage(None, tmp_path)
+    study = open_study(request, overrides, SearchSpace.from_request(request), None, storage, tmp_path)
+    found = with_stored(request, overrides)[2]
+    assert found is not None
+    assert found.study_name == study.study_name == "lr_entropy"
+
+
+def test_a_study_resumes_with_another_executor(tmp_path):
+    begun = [
+        "study=s",
+        LR,
+        "tracking=off",
+        f"runs_dir={tmp_path}",
+        "sweep/executor=ray",
+        "sweep.executor.address=a:1",
+    ]
+    request, storage = compose_sweep(begun), open_storage(None, tmp_path)
+    open_study(request, begun, SearchSpace.from_request(request), None, storage, tmp_path)
+    for more, address in (
+        (["sweep/executor=ray", "sweep.executor.address=b:1"], "b:1"),
+        (["sweep/executor=local"], None),
+    ):
+        asked = ["study=s", f"runs_dir={tmp_path}", *more]
+        executor = with_stored(compose_sweep(asked), asked)[1].entry.sweep.executor
+        assert getattr(executor, "address", None) == address
 
 
 @in_a_file

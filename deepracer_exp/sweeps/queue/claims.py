@@ -179,6 +179,11 @@ class TrialClaims:
                 connection.execute(self._statement(values, _of.number == row.number, *where))
         return len(mine)
 
+    def forget(self) -> None:
+        """Delete the claims."""
+        with self._engine.begin() as connection:
+            connection.execute(sa.delete(_table).where(_of.study == self.study))
+
     def all(self) -> list[Claim]:
         """Return all claims by the number of the trial, reading only those that may have changed."""
         final = self._final

@@ -181,6 +181,19 @@ def patiently(call: Callable[[], Result], patience_s: float) -> Result:
         raise RunFailed(f"the study's database {what}: {_reason(error)}") from None
 
 
+@contextmanager
+def answering() -> Iterator[None]:
+    """Report a database that does not answer where nothing waits for it.
+
+    Raises:
+        RunFailed: it does not answer.
+    """
+    try:
+        yield
+    except DOWN as error:
+        raise RunFailed(f"the study's database cannot be used: {_reason(error)}") from None
+
+
 def _waiting(call: Callable[[], Result], patience_s: float) -> Result:
     said = False
 

@@ -17,13 +17,14 @@ from deepracer_exp.config.dimension import Choice
 from deepracer_exp.config.options import groups
 from deepracer_exp.config.sweep import SweepRequest
 from deepracer_exp.errors import BadInput, nearest
-from deepracer_exp.runs.run_files import read_config
+from deepracer_exp.runs.lineage import read_lineage
+from deepracer_exp.runs.run_files import SUMMARY, read_config, read_object
 from deepracer_exp.sweeps import DEFAULT_FILE
 from deepracer_exp.sweeps.search.objectives import MEASURES
 from deepracer_exp.sweeps.search.space import SearchSpace, value_at
 from deepracer_exp.tracking.resolve import resolve
 
-from .claims import TABLE
+from .claims import TABLE, TrialClaims
 from .storage import open_storage, resolve_database
 from .widening import complete_widening, widen
 
@@ -42,6 +43,8 @@ MAY_DIFFER = (
     "runs_dir",
 )
 """Keys that do not change the trials themselves."""
+_EXECUTOR = "sweep.executor."
+"""Beginning of further such keys: the settings of `sweep/executor`."""
 _OF_LAST_START = ("trials", "clone")
 """Settings that a resumed study takes from its last start, because they may have changed since it began."""
 _SAME = ("objectives", "seeds", "protocol", "parent")
@@ -92,14 +95,20 @@ def with_stored(
     from deepracer_exp.config.overrides import key_of, override_line
     from deepracer_exp.config.sweep import compose_sweep
 
-    names_only = not set(map(key_of, overrides)) - {*MAY_DIFFER}
+    keys = set(map(key_of, overrides))
+    names_only = not {key for key in keys if not key.startswith(_EXECUTOR)} - {*MAY_DIFFER}
     study = _existing(request, names_only)
     if study is None:
         return overrides, request, None
     if names_only:
         stored = study.user_attrs
         last = [override_line(f"sweep.{key}", stored[key]) for key in _OF_LAST_START if key in stored]
-        overrides = [*stored.get("overrides", ()), *last, *overrides]
+        begun_with = [
+            line
+            for line in stored.get("overrides", ())
+            if "sweep/executor" not in keys or not line.startswith(_EXECUTOR)
+        ]
+        overrides = [*begun_with, *last, *overrides]
         request = compose_sweep(overrides, stored=True)
     if not request.space:
         raise BadInput(
@@ -140,7 +149,11 @@ def open_study(
         "runs_dir": str(runs_dir),
         "claims": TABLE,
         # The address may contain a password, and is given again to resume; what was enqueued is among the trials.
-        "overrides": [line for line in overrides if key_of(line) not in ("sweep.storage", "sweep.enqueue")],
+        "overrides": [
+            _expanded(line, request.space)
+            for line in overrides
+            if key_of(line) not in ("sweep.storage", "sweep.enqueue")
+        ],
         # The last one: a study that has it has all of them.
         "space": space.as_text(),
     }
@@ -154,6 +167,7 @@ def open_study(
         study = load_study(name, storage)
     stored = study.user_attrs
     if "space" not in stored:  # it is new, or the process that began it was killed right here
+        TrialClaims(storage.engine, name).forget()  # those of a study of that name that was deleted
         for key, value in wanted.items():
             study.set_user_attr(key, value)
     else:
@@ -164,6 +178,11 @@ def open_study(
             def composed(lines: list[str]) -> "Composition":
                 return plan_trial(lines, parent, stored=True).composition
 
+            if sweep.sampler == "grid":
+                raise BadInput(
+                    f"study={name}: sweep.sampler=grid drives the points of the search that it began with: "
+                    f"{'; '.join(changes)}; give another name"
+                )
             study = widen(study, storage, space, wanted, composed)
             _log.warning(
                 "study %s: a wider search from now on, with the %d trials that it has: %s",
@@ -184,6 +203,12 @@ def open_study(
         # Optuna Dashboard calls them "Objective 0" otherwise.
         study.set_metric_names([MEASURES[objective].label for objective in sweep.objectives])
     return study
+
+
+def _expanded(override: str, space: Mapping[str, str]) -> str:
+    """Return an override with the options that its `glob` found: later ones are no part of the study."""
+    key, _, value = override.partition("=")
+    return f"{key}={space[key]}" if value.startswith("glob(") else override
 
 
 def _differences(stored: dict[str, object], wanted: dict[str, object], searched: set[str]) -> list[str]:
@@ -216,7 +241,7 @@ def _chooses_processes(override: str) -> bool:
 
 def _existing(request: "SweepRequest", must_exist: bool) -> Study | None:
     """Return the study that the request names, if it exists; no file is created by looking."""
-    if request.entry.study is None:
+    if request.entry.study is None and must_exist:
         return None
     if request.entry.sweep.storage is None and not (request.runs_dir / DEFAULT_FILE).exists():
         return None
@@ -243,12 +268,19 @@ def enqueue(study: Study, settings: Sequence[Mapping[str, Choice]]) -> None:
         study.enqueue_trial(dict(setting), skip_if_exists=True)
 
 
+def _trial_of(run: Path) -> Path:
+    """Return the trial whose settings, but not its learning rate, a sweep's last clone has; else the run itself."""
+    lineage, summary = read_lineage(run), read_object(run / SUMMARY)
+    of_last_stage = lineage is not None and "study" in summary and "trial" not in summary
+    return run.with_name(lineage.parent) if lineage is not None and of_last_stage else run
+
+
 def _setting(entry: Mapping[str, Any] | str, space: SearchSpace, runs_dir: Path) -> dict[str, Choice]:
     axes = {axis.key: axis for axis in space.dimensions}
     where = f"sweep.enqueue={entry}"
     plain: Mapping[str, Any]
     if isinstance(entry, str):
-        values = read_config(resolve(entry, runs_dir, None).path)
+        values = read_config(_trial_of(resolve(entry, runs_dir, None).path))
         # A run has the values of an option, not its name.
         plain = {key: value for key in axes if key not in groups() for value in value_at(values, key)}
     else:

@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 import optuna
-from optuna.storages import BaseStorage
+from optuna.storages import RDBStorage
 from optuna.trial import FrozenTrial
 
 from deepracer_exp.config.overrides import key_of
@@ -47,7 +47,7 @@ from deepracer_exp.training.trainer import Callback, Trainer
 
 from .claims import TrialClaims
 from .lease import Lease
-from .storage import patiently
+from .storage import patiently, resolve_database
 from .worker_config import RUN_ID, WorkerConfig, plan_trial
 
 Value = TypeVar("Value")
@@ -79,7 +79,7 @@ class TrialRun(Callback):
         claims: TrialClaims,
         lease: Lease,
         study: optuna.Study,
-        storage: BaseStorage,
+        storage: RDBStorage,
         trial_id: int,
         projector: Projector,
     ):
@@ -185,13 +185,22 @@ class TrialRun(Callback):
             return list(stored)
         # Before anything is drawn: the study's cache knows a trial that another process made only once it has read all
         # of them, and not every sampler reads them.
-        trials = self._patiently(lambda: self._study.get_trials(deepcopy=False))
+        self._patiently(lambda: self._study.get_trials(deepcopy=False))
         drawn = self._patiently(lambda: self._config.space.suggest(self._trial))
-        overrides = self._with_own_seed(drawn, [trial for trial in trials if trial.number != self._number])
         self._lease.confirm()
-        self._patiently(lambda: self._trial.set_user_attr("drawn", drawn))
-        self._patiently(lambda: self._trial.set_user_attr("overrides", overrides))
-        return overrides
+        database = resolve_database(self._config.config.storage, self._config.runs_dir)
+
+        def decided() -> list[str]:
+            # One worker at a time: two that drew the same together would train the same run.
+            with database.creation_lock(self._storage.engine):
+                trials = self._study.get_trials(deepcopy=False)
+                others = [trial for trial in trials if trial.number != self._number]
+                overrides = self._with_own_seed(drawn, others)
+                self._trial.set_user_attr("drawn", drawn)
+                self._trial.set_user_attr("overrides", overrides)
+            return overrides
+
+        return self._patiently(decided)
 
     def _with_own_seed(self, drawn: list[str], others: Sequence[FrozenTrial]) -> list[str]:
         """Return the drawn overrides, with the next seed if another trial drew the same: it would be the same run."""

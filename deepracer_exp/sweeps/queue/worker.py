@@ -113,14 +113,18 @@ class Worker:
         """
         storage = self._storage
         study_id = storage.get_study_id_from_name(self._config.study)
-        with contextlib.suppress(KeyError):
+
+        def begun() -> int:
             trial_id = storage.get_trial_id_from_study_id_trial_number(study_id, number)
             if storage.get_trial(trial_id).state == TrialState.WAITING:  # enqueued
                 storage.set_trial_state_values(trial_id, TrialState.RUNNING)
             return trial_id
+
+        with contextlib.suppress(KeyError):
+            return begun()
         with self._database.creation_lock(storage.engine):
             with contextlib.suppress(KeyError):
-                return storage.get_trial_id_from_study_id_trial_number(study_id, number)
+                return begun()
             created = storage.create_new_trial(study_id)
             while storage.get_trial_number_from_id(created) < number:
                 created = storage.create_new_trial(study_id)

@@ -180,6 +180,10 @@ def _check_cmaes(config: SweepConfig, space: SearchSpace) -> None:
 
 
 def _check_grid(config: SweepConfig, space: SearchSpace) -> None:
+    if config.enqueue:
+        raise BadInput(
+            "sweep.enqueue", "the grid drives each of its points anyway", "[] with sweep.sampler=grid"
+        )
     points = math.prod(map(len, space.grid().values()))
     if config.trials > points:
         raise BadInput(
