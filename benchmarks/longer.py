@@ -20,8 +20,8 @@ conditions and 64 on held-out ones. JSON has for each track and recipe, in lists
   `completion` and `held_out`, per cent, with those of each seed;
 - `worst_rise`: how far any evaluation after the first lap is above the fastest one before it, as a share; null where
   there is no lap at all, or none any more later;
-- `bound_s`: the bound of a lap from standstill at the start line by a perfect driver of this car within the car's own
-  limits, and how far laps are above it as a share: `over_bound` after 1.5 million steps, `over_bound_end` after all;
+- `bound_s`: the bound of a lap from standstill at the start line by a perfect driver of this car (`deepracer-exp
+  tracks NAME --fastest` prints it), and how far laps are above it as a share: `over_bound` after 1.5 million steps, `over_bound_end` after all;
   null without a lap there, or where a training ends before.
 
 `--runs-dir DIR` leaves the runs in DIR and takes those that it finds finished there: an interrupted benchmark
@@ -42,7 +42,7 @@ import numpy as np
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.setup import build_courses
-from deepracer_exp.evaluation.fastest.fastest_lap import Question, car_limits
+from deepracer_exp.evaluation.fastest.fastest_lap import Question, fastest_lap
 from deepracer_exp.reports.tables.evidence import Interval, iqm_band
 from deepracer_exp.reports.tables.statistics import Values
 
@@ -68,11 +68,9 @@ def training_overrides(track: str, recipe: str, steps: int | None, overrides: Se
 
 
 def lap_bound_s(experiment: Experiment) -> float:
-    """Return the lap of a perfect driver of an experiment's car on its track."""
+    """Return the bound of an experiment's fastest lap on its track; the search takes a minute, and is kept."""
     (course,) = build_courses(experiment)
-    low, high = car_limits(experiment.car)
-    bound_s, _ = Question(experiment=experiment, track=course.tracks[0], low=low, high=high).bound()
-    return bound_s
+    return fastest_lap(Question.of(experiment, course.tracks[0])).bound_s
 
 
 def evaluations(runs: Sequence[Path]) -> tuple[list[int], Values, Values, Values]:
