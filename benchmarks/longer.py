@@ -21,8 +21,8 @@ conditions and 64 on held-out ones. JSON has for each track and recipe, in lists
 - `worst_rise`: how far any evaluation after the first lap is above the fastest one before it, as a share; null where
   there is no lap at all, or none any more later;
 - `bound_s`: the bound of a lap from standstill at the start line by a perfect driver of this car (`deepracer-exp
-  tracks NAME --fastest` prints it), and how far laps are above it as a share: `over_bound` after 1.5 million steps, `over_bound_end` after all;
-  null without a lap there, or where a training ends before.
+  tracks NAME --fastest` prints it), and how far laps are above it as a share: `over_bound` after 1.5 million steps,
+  `over_bound_end` after all; null without a lap there, or where a training ends before.
 
 `--runs-dir DIR` leaves the runs in DIR and takes those that it finds finished there: an interrupted benchmark
 continues.

@@ -35,11 +35,10 @@ def replays(run) -> list[str]:
 @pytest.mark.parametrize(
     "overrides",
     [
-        SAC,
         (*SAC, "action_space=discrete"),
         (*SAC, SMALL, *PICTURES),
     ],
-    ids=["continuous", "list", "full, of pictures"],
+    ids=["list", "full, of pictures"],
 )
 def test_a_run_that_continues_is_the_run_that_was_never_interrupted(trained, copied, call, overrides):
     whole = trained(*overrides, *budget(6))

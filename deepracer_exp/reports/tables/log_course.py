@@ -42,6 +42,8 @@ _LEAST_WAYPOINTS = 20
 _ESTIMATE_NEAR = 0.1
 """Share by which an estimated centre line may be longer or shorter than the logged length."""
 _HALF_CAR_M = 0.1
+_DIRECTION_ROWS = 60
+"""Rows of an episode from which its driving direction is determined: 4 s."""
 _JUMP = 20.0
 """Per cent of progress between adjacent rows beyond which the car must have been reset."""
 
@@ -278,6 +280,20 @@ def progress_along(course: Track, steps: pd.DataFrame, episode: NDArray[np.int64
     gained = np.diff(steps["progress"].to_numpy(np.float64), prepend=np.nan)
     counted = (np.diff(episode, prepend=-1) == 0) & (np.abs(gained) < _JUMP) & np.isfinite(gone)
     return np.where(counted, gone * gained, 0.0)
+
+
+def driven_against(course: Track, steps: pd.DataFrame, episode: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return whether each row is of an episode driven against the course's own direction, (n,).
+
+    `episode` is the number of each row's episode, non-decreasing. An episode that does not move counts as driven in the
+    course's own direction.
+    """
+    within = np.arange(len(episode)) - np.searchsorted(episode, episode)
+    known = np.isfinite(steps[["X", "Y", "progress"]].to_numpy()).all(axis=1)
+    rows = np.flatnonzero(known & (within < _DIRECTION_ROWS))
+    along = progress_along(course, steps.iloc[rows], episode[rows])
+    sums = np.bincount(episode[rows], along, minlength=int(episode.max(initial=0)) + 1)
+    return (sums < 0)[episode]
 
 
 def _unknown(name: str, rows: pd.DataFrame) -> str:

@@ -11,15 +11,13 @@ from deepracer_exp.config.car import CarConfig
 from deepracer_exp.rewards.params import TrackParams, rows, scalar_params, select
 from deepracer_exp.tracks.track import Track, Tracks
 
-from .log_course import progress_along, recorded_wheels_on_road
+from .log_course import driven_against, recorded_wheels_on_road
 
 Ids = NDArray[np.intp]
 Floats = NDArray[np.float64]
 
 UNPAID = ("prepare", "pause", "park")
 """Statuses at which the service gives no reward and calls no function (deepracer-simapp, rollout_agent_ctrl.py)."""
-_DIRECTION_ROWS = 60
-"""Rows of an episode from which its driving direction is determined: 4 s."""
 _DECIDED = {"in_progress": False, "off_track": True}
 """Statuses that determine `is_offtrack`; for the others it is computed from the wheels."""
 
@@ -55,7 +53,7 @@ class RecordedParams:
         self._tracks = Tracks(tracks)
         self.known = np.isfinite(steps[["X", "Y", "yaw", "progress"]].to_numpy()).all(axis=1)
         self.paid = self.known & ~steps["episode_status"].isin(UNPAID).to_numpy()
-        self.track_index: Ids = self._against(course, episode)
+        self.track_index: Ids = driven_against(course, steps, episode).astype(np.intp)
         self._previous_progress = self._progress_before(episode)
 
     @property
@@ -109,15 +107,6 @@ class RecordedParams:
         follows = (np.diff(episode, prepend=-1) == 0) & (np.diff(number, prepend=np.nan) == 1)
         follows &= np.roll(self.paid, 1)
         return np.where(follows, np.roll(progress, 1), progress)
-
-    def _against(self, course: Track, episode: NDArray[np.int64]) -> Ids:
-        """Return 1 for the rows of episodes driven against the course's own direction, (n,)."""
-        within = np.arange(len(episode)) - np.searchsorted(episode, episode)
-        rows = np.flatnonzero(self.known & (within < _DIRECTION_ROWS))
-        along = progress_along(course, self._steps.iloc[rows], episode[rows])
-        # An episode that does not move counts as driven in the course's own direction.
-        sums = np.bincount(episode[rows], along, minlength=int(episode.max(initial=0)) + 1)
-        return (sums < 0).astype(np.intp)[episode]
 
 
 def _other_way(track: Track) -> Track:

@@ -12,7 +12,8 @@ from deepracer_exp.config.parse import parse_experiment
 from deepracer_exp.env.trace_columns import SCHEMA
 from deepracer_exp.errors import BadInput
 from deepracer_exp.reports.tables import reward_replay
-from deepracer_exp.reports.tables.log_view import LogView, prepare
+from deepracer_exp.reports.tables.log_course import driven_against
+from deepracer_exp.reports.tables.log_view import ONE_WAY, LogView, prepare
 from deepracer_exp.reports.tables.reward_replay import ReplayedRewards
 from deepracer_exp.rewards.source import named_reward_source
 from deepracer_exp.runs import trace
@@ -77,10 +78,16 @@ def test_a_runs_own_reward_is_paid_again_in_every_row(tmp_path, monkeypatch, ove
     run = call_in(tmp_path, "train", *IN_PROCESS, *QUICK, *overrides, "budget.iterations=2").folder
     source = named_reward_source(str(run / "reward_function.py"))
     car = parse_experiment(read_config(run)).car
-    replayed = reward_replay.replay_reward(prepare(read_run_recording(run)), source, car)
+    view = prepare(read_run_recording(run))
+    replayed = reward_replay.replay_reward(view, source, car)
     np.testing.assert_allclose(replayed.steps["new_reward"], replayed.steps["reward"], rtol=0, atol=1e-9)
     both = {False, True} if "track.direction=alternate" in overrides else {False}
     assert set(replayed.waypoints["reversed"]) == both
+    # Everything else on its page is of one direction: at a waypoint the other way is another place.
+    alone = {problem.reason for problem in view.problems} == {ONE_WAY}
+    assert alone is (len(both) == 2)
+    assert (len(view.steps) < len(replayed.steps)) is alone
+    assert not driven_against(view.course, view.steps, view.steps["episode"].to_numpy()).any()
 
 
 def test_the_decimals_of_a_trace_are_enough_to_pay_a_reward_again(own):
