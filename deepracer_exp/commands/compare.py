@@ -98,6 +98,8 @@ def _compare(args: argparse.Namespace) -> int:
         )
     if args.replay is not None and len(runs) + len(logs) > 2:
         raise BadInput(f"--replay {args.replay}: {len(runs) + len(logs)} runs and logs given; accepted: two")
+    if args.track is not None and not logs:
+        raise BadInput(f"--track {args.track}", "accepted with logs only", "runs without it")
     if logs and args.format != "table":
         raise BadInput(f"--format {args.format}: accepted with runs only; {logs[0].word} is a log")
     return _compare_recordings(args, items) if logs else compare_runs(args, items)

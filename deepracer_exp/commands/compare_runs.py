@@ -8,7 +8,7 @@ from pathlib import Path
 from string import ascii_uppercase
 from typing import TYPE_CHECKING
 
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import BadInput, count
 from deepracer_exp.runs.run_files import METRICS
 from deepracer_exp.runs.run_result import TRAINING_LAPS
 
@@ -46,6 +46,12 @@ def compare_runs(args: argparse.Namespace, items: Sequence[Item]) -> int:
 
     groups = _groups(items)
     records = [record for group in groups for record in group.records]
+    if len(records) < 2:
+        raise BadInput(
+            " ".join(item.word for item in items),
+            f"{count(len(records), 'run')} with an iteration",
+            "two or more, or an experiment or a study that has them",
+        )
     if args.format == "csv":
         curves_table(groups).to_csv(sys.stdout, index=False)
     elif args.format == "json":
@@ -78,8 +84,6 @@ def _groups(items: Sequence[Item]) -> "list[RunGroup]":
         key = path.resolve()
         if key not in records:
             records[key] = read_record(path)
-            if not records[key].rows:
-                raise BadInput(f"{path / METRICS}: has no iteration; there is nothing to compare")
         return records[key]
 
     several = len({item.word for item in items if item.is_experiment and item.group is None}) > 1
@@ -92,6 +96,10 @@ def _groups(items: Sequence[Item]) -> "list[RunGroup]":
             if item.is_experiment and not (path / METRICS).is_file():
                 continue
             pair = item.group, read(path)
+            if not pair[1].rows:
+                if item.is_experiment:
+                    continue
+                raise BadInput(f"{path / METRICS}: has no iteration; there is nothing to compare")
             if pair not in pairs:
                 pairs.append(pair)
     groups: list[RunGroup] = []

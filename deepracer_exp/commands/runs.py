@@ -83,6 +83,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         actions,
         "lineage",
         _lineage,
+        entry=None,
         help="show a run's family tree",
         description="Show what a run was cloned from and its clones, what each clone changed and achieved, and the "
         "best of each generation. Reads only the folders of the runs.",
@@ -93,6 +94,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         actions,
         "promote",
         _promote,
+        entry=None,
         help="register a checkpoint under an alias",
         description="Register a checkpoint as a version of a model in MLflow and give it an alias, by which evaluate, "
         "export and clone find it. From then on nothing removes it from the run's folder.",
@@ -111,6 +113,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         actions,
         "clean",
         _clean,
+        entry=None,
         help="list what can be removed, or remove it",
         description="List what can be removed from the folders of the runs, with sizes; with --apply, remove it.",
         epilog=_CLEAN_EPILOG,
@@ -132,6 +135,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         commands,
         "ui",
         _ui,
+        entry=None,
         help="open the MLflow pages of the recorded runs",
         description="Serve the MLflow pages of the project's runs on 127.0.0.1 until Ctrl-C.",
     )
@@ -141,7 +145,8 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 def with_default_action(arguments: list[str]) -> list[str]:
     """Return the arguments of a command line in which `runs` without an action means `runs list`."""
-    if arguments[:1] == ["runs"] and (len(arguments) == 1 or is_override(arguments[1])):
+    flag = len(arguments) > 1 and arguments[1].startswith("-") and arguments[1] not in ("-h", "--help")
+    if arguments[:1] == ["runs"] and (len(arguments) == 1 or flag or is_override(arguments[1])):
         return ["runs", LIST, *arguments[1:]]
     return arguments
 

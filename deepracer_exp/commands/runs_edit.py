@@ -34,6 +34,7 @@ def add_edits(actions: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
         actions,
         "send",
         _send,
+        entry=None,
         help="record in MLflow what it lacks of ended runs",
         description="Record in MLflow, from the folders of ended runs, what it lacks because it did not answer or "
         "refused; without RUN, of all runs of this store in runs_dir.",
@@ -48,6 +49,7 @@ def add_edits(actions: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
             actions,
             name,
             call,
+            entry=None,
             help=what,
             description=f"{what[0].upper()}{what[1:]}. This is kept in the run's folder and in MLflow. "
             "A run whose folder is elsewhere is given by MLflow's id.",
@@ -61,6 +63,7 @@ def add_edits(actions: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
         actions,
         "delete",
         _delete,
+        entry=None,
         help="delete runs and mark them as deleted in MLflow",
         description="Delete the folders of runs in runs_dir, and mark the runs as deleted in MLflow, after a question. "
         "Runs in progress stay, and so do those that a clone or a registered model needs.",

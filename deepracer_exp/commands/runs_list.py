@@ -51,6 +51,7 @@ def add_list(actions: "argparse._SubParsersAction[argparse.ArgumentParser]") -> 
         actions,
         LIST,
         _list,
+        entry=None,
         help="list runs, newest first (the default)",
         description="List the runs of a folder or, with tracking.uri=URI, of an MLflow store, newest first.",
         epilog=_EPILOG,
@@ -92,9 +93,9 @@ def _list(args: argparse.Namespace) -> int:
     if args.sort is not None:
         _check_column(f"--sort {args.sort}", args.sort, columns)
         valued = [row for row in rows if row.get(args.sort) is not None]
-        valued.sort(key=lambda row: row[args.sort])
+        valued.sort(key=lambda row: row[args.sort], reverse=args.reverse)
         rows = [*valued, *(row for row in rows if row.get(args.sort) is None)]
-    if args.reverse:
+    elif args.reverse:
         rows.reverse()
     if args.format == "json":
         print(json.dumps([{key: _json(row.get(key)) for key in columns} for row in rows], indent=1))

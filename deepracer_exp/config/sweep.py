@@ -25,7 +25,7 @@ from .dimension import Choices, as_override, dimension, override_value, plain_ex
 from .evaluation import EvaluationConfig
 from .experiment import SafeName
 from .options import groups
-from .overrides import PLAIN_TEXT, key_of, override_line, parse_sweep
+from .overrides import PLAIN_TEXT, key_of, override_line, parse_single, parse_sweep
 from .own_class import REFERENCE
 from .parse import parse_config
 
@@ -144,6 +144,13 @@ class SweepRequest:
         """Return the study's name: the given one, or that of the ready-made sweep."""
         option = self.composition.choices[_ENTRY]
         return self.entry.study or (_ENTRY if option == "own" else option)
+
+    @property
+    def tracking_uri(self) -> str | None:
+        """Return the store of MLflow that the user has named; None: the one in `runs_dir`."""
+        named = [line for line in self.base if key_of(line) == "tracking.uri"]
+        value = parse_single(named[-1]).value() if named else None
+        return None if value is None else str(value)
 
     def refuse_empty(self) -> None:
         """Refuse a sweep with nothing to search.

@@ -19,6 +19,8 @@ MANIFEST = "manifest.json"
 BEST = "best"
 LINKS = (BEST, "last", "fastest")
 """Names of the best checkpoint, the last one, and the fastest reliable one."""
+_CLONED = "cloned into "
+"""Beginning of the reason of a pin for a clone, before its folder."""
 _PINNED = "pinned.json"
 _PINS = TypeAdapter(dict[str, list[str]])
 
@@ -129,6 +131,11 @@ def checkpoint_sha256(folder: Path) -> str:
     return _sha256(folder / HASHES)
 
 
+def pin_for_clone(checkpoints: Path, name: str, clone: Path) -> None:
+    """Pin a checkpoint as long as the folder of its clone is there; the rest is as for `pin`."""
+    pin(checkpoints, name, f"{_CLONED}{clone.resolve()}")
+
+
 def pin(checkpoints: Path, name: str, why: str) -> None:
     """Pin a checkpoint, so that it stays.
 
@@ -148,9 +155,16 @@ def pinned(checkpoints: Path) -> dict[str, list[str]]:
         BadInput: their file cannot be read.
     """
     try:
-        return read_json_as(checkpoints / _PINNED, _PINS, "a clone or `runs promote`") or {}
+        pins = read_json_as(checkpoints / _PINNED, _PINS, "a clone or `runs promote`") or {}
     except BadInput as error:
         raise BadInput(f"{error}; nothing in {checkpoints} is removed") from error
+    kept = {name: [why for why in reasons if not _is_over(why)] for name, reasons in pins.items()}
+    return {name: reasons for name, reasons in kept.items() if reasons}
+
+
+def _is_over(why: str) -> bool:
+    clone = Path(why.removeprefix(_CLONED))
+    return why.startswith(_CLONED) and clone.is_absolute() and not clone.exists()
 
 
 def _files(folder: Path) -> list[str]:

@@ -108,6 +108,8 @@ def remove(item: Removable) -> bool:
         folder = RunFolder(item.run)
     except BadInput:
         return False
+    except OSError as error:
+        raise RunFailed(f"{error.filename}: cannot be removed: {error.strerror}") from error
     try:
         pins = pinned(item.run / CHECKPOINTS)
         if (pins and item.run in item.paths) or pins.keys() & {path.name for path in item.paths}:
@@ -136,7 +138,7 @@ def _search(
         removables.kept.append((run, reason))
         return
     run_id = read_run_id(run)
-    pins = wanted | {name: ", ".join(reasons) for name, reasons in pinned(run / CHECKPOINTS).items()}
+    pins = wanted | {name: _few(reasons) for name, reasons in pinned(run / CHECKPOINTS).items()}
     if overview is not None and run_id is not None and overview.deleted.get(run_id):
         if not pins:
             removables.removable.append(Removable(run, DELETED, (run,), _size(run)))
@@ -206,12 +208,18 @@ def deletable(run: Path, runs_dir: Path) -> Removable:
     if run.is_symlink() or place.parent.parent != runs_dir.resolve() or place.parent.is_symlink():
         raise BadInput(run, f"is not a run's own folder in runs_dir={runs_dir}; nothing was deleted")
     wanted = _cloned_from(runs_dir)[full_name(place)] | {
-        name: ", ".join(reasons) for name, reasons in pinned(run / CHECKPOINTS).items()
+        name: _few(reasons) for name, reasons in pinned(run / CHECKPOINTS).items()
     }
     reasons = [f"{checkpoint_words(name)} is {why}" for name, why in sorted(wanted.items())]
     if reason := _in_progress(run) or ", ".join(reasons):
         raise BadInput(run, f"{reason}; nothing was deleted")
     return Removable(run, ASKED, (run,), _size(run))
+
+
+def _few(reasons: Sequence[str]) -> str:
+    """Return reasons as text; a sweep's trials may be many clones."""
+    more = f" and {len(reasons) - 2} more" if len(reasons) > 3 else ""
+    return ", ".join(reasons[: 2 if more else 3]) + more
 
 
 def _own_runs(runs_dir: Path) -> Iterator[Path]:

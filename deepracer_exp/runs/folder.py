@@ -2,6 +2,7 @@
 
 import contextlib
 import datetime
+import fcntl
 import json
 import logging
 import math
@@ -190,12 +191,13 @@ class RunFolder:
 
 def is_held(run_dir: Path) -> bool:
     """Return whether a process is training in a run's folder."""
-    if not (run_dir / RUNNING).exists():
-        return False
     try:
-        _locked(run_dir / RUNNING).release()
-    except BadInput:
+        with (run_dir / RUNNING).open("rb") as file:  # only read: it may be another user's
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
         return True
+    except FileNotFoundError:
+        return False
     return False
 
 

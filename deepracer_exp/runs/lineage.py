@@ -211,10 +211,10 @@ def _best_of_groups(
 
 
 def _parent(lineage: Lineage, places: list[Path]) -> Path:
-    """Return the parent's folder: where it was, where all runs have moved to, or where it was if it is gone."""
+    """Return the parent's folder: where all runs have moved or were copied to, or where it was."""
     recorded = Path(lineage.parent_dir)
     moved = [place / recorded.parent.name / lineage.parent for place in places]
-    return next((path for path in (recorded, *moved) if is_run(path)), recorded).resolve()
+    return next((path for path in moved if is_run(path)), recorded).resolve()
 
 
 def _grow(

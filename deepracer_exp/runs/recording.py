@@ -121,8 +121,6 @@ class RunRecording:
     """Episodes on usual conditions, where only a share of the cars differed from them; None: all were alike."""
     counted: pd.DataFrame | None = None
     """All steps and episodes by iteration, `COUNTED_COLUMNS`, where the trace lacks some; None on several tracks."""
-    alternating: frozenset[str] = frozenset()
-    """Names of the tracks that each car drives in both directions in turn."""
     laps_only: bool = False
     """Whether the trace has complete laps only."""
     others: PlacedOthers | None = None
@@ -197,7 +195,6 @@ def read_run_recording(folder: Path) -> RunRecording:
         usual_episodes=_usual_episodes(traces, config, problems),
         counted=counted if _track(config) is not None and counted["steps"].sum() > len(steps) else None,
         laps_only=laps_only,
-        alternating=_alternating(config),
         others=_others(folder, config, problems),
     )
 
@@ -421,18 +418,6 @@ def _track(config: Mapping[str, Any]) -> str | None:
     track = config.get("track")
     name = track.get("name") if isinstance(track, Mapping) else None
     return name if isinstance(name, str) else None
-
-
-def _alternating(config: Mapping[str, Any]) -> frozenset[str]:
-    tracks = config.get("track")
-    if not isinstance(tracks, Mapping):
-        return frozenset()
-    by_name = {tracks["name"]: tracks} if "name" in tracks else tracks
-    return frozenset(
-        name
-        for name, track in by_name.items()
-        if isinstance(track, Mapping) and track.get("direction") == "alternate"
-    )
 
 
 def _text(file: Path, problems: list[LogProblem], files: list[Path]) -> str:

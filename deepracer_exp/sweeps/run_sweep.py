@@ -331,7 +331,7 @@ def _parent(request: SweepRequest, study: Study | None) -> Parent | None:
         return None
     if study is not None and study.user_attrs.get("parent") == run and "parent_run" in study.user_attrs:
         return Parent(**study.user_attrs["parent_run"])
-    return Parent.find(run, request.study, request.runs_dir)
+    return Parent.find(run, request.study, request.runs_dir, request.tracking_uri)
 
 
 def _evaluations(experiment: Experiment, request: SweepRequest) -> int | None:

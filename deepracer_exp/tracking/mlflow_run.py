@@ -67,9 +67,11 @@ class MLflowRun:
     def open(self, tracked: TrackedRun, run_id: str | None = None) -> None:
         """Create the run, or continue it if the store has it already, even if its answer was lost.
 
-        `run_id`: the id of an earlier answer.
+        `run_id`: the id of an earlier answer; a store that does not know it is a new one.
         """
         with store_errors():
+            if run_id is not None and not self._has(run_id):
+                run_id = None
             if run_id is None:
                 experiment_id = self._experiment_id(tracked.experiment)
                 run_id = self._find(experiment_id, tracked)
@@ -81,6 +83,15 @@ class MLflowRun:
             if END_TAG in self._tags and END_TAG not in tracked.tags:
                 self._client.delete_tag(run_id, END_TAG)
                 del self._tags[END_TAG]
+
+    def _has(self, run_id: str) -> bool:
+        try:
+            self._client.get_run(run_id)
+        except MlflowException as error:
+            if error.error_code != "RESOURCE_DOES_NOT_EXIST":
+                raise
+            return False
+        return True
 
     def read(self, run_id: str) -> None:
         """Open a run of the store without changing its state."""
@@ -241,9 +252,11 @@ class MLflowRun:
 
     def _find(self, experiment_id: str, tracked: TrackedRun) -> str | None:
         began = f"attributes.start_time = {tracked.start_ms}"
-        wanted = (tracked.run_name, tracked.tags.get("run_dir"))
+        run_dir = tracked.tags.get("run_dir")
         for run in self._client.search_runs([experiment_id], began, ViewType.ALL):
-            if (run.info.run_name, run.data.tags.get("run_dir")) == wanted:
+            # By its name, which people change, only where there is nothing else.
+            is_same = run.info.run_name == tracked.run_name if run_dir is None else True
+            if is_same and run.data.tags.get("run_dir") == run_dir:
                 return run.info.run_id
         return None
 

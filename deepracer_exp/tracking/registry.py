@@ -174,10 +174,21 @@ def promote(
         versions = pages(client.search_model_versions, filter_string=f"name = '{model}'")
         version = next((candidate for candidate in versions if candidate.tags.items() >= tags.items()), None)
         if version is None:
-            metrics = _evaluated(run, folder)
+            row = _row_of(run, folder)
+            metrics = _evaluated(row)
             store, experiment_id = existing_store(uri, runs_dir), recorded.experiment_id
             logged = _log_model(
-                client, store, experiment_id, run_id, run, folder, tags, features, seen, metrics
+                client,
+                store,
+                experiment_id,
+                run_id,
+                run,
+                folder,
+                tags,
+                features,
+                seen,
+                metrics,
+                row.get("env_steps"),
             )
             shown = f"Checkpoint {int(folder.name)} of `{full_name(run)}`: {race_result(metrics)}.\n\n{picture(run_id)}"
             version = _version_of(client, logged.model_id, model, run_id, tags, shown)
@@ -185,11 +196,16 @@ def promote(
         return _registered(what, version, alias)
 
 
-def _evaluated(run: Path, checkpoint: Path) -> dict[str, float]:
-    """Return the evaluation of a checkpoint after its iteration, by metric name in MLflow."""
+def _row_of(run: Path, checkpoint: Path) -> dict[str, Any]:
+    """Return the metrics of a checkpoint's iteration, nothing where they are missing."""
     file = run / METRICS
     rows = read_metrics(file) if file.exists() else []
     (row,) = [row for row in rows if row["iteration"] == int(checkpoint.name)] or [{}]
+    return row
+
+
+def _evaluated(row: Mapping[str, Any]) -> dict[str, float]:
+    """Return the evaluation of an iteration by metric name in MLflow."""
     named = metric_names(row)
     return {key: value for key, value in named.items() if key.startswith("race/") and value is not None}
 
@@ -205,13 +221,18 @@ def _log_model(
     features: Sequence[str],
     seen: Mapping[str, tuple[int, ...]],
     metrics: Mapping[str, float],
+    env_steps: int | None,
 ) -> "LoggedModel":
-    """Log a checkpoint as a model of MLflow, with the tensors and JSON of the run's folder."""
+    """Log a checkpoint as a model of MLflow, with the tensors and JSON of the run's folder.
+
+    `metrics` were measured after `env_steps`.
+    """
     import numpy as np
     from mlflow.models import Model, ModelSignature
     from mlflow.types import Schema, TensorSpec
 
-    name = f"{run.name}-{checkpoint.name}"
+    # MLflow accepts no dots, colons or quotes in this name, which nothing reads.
+    name = re.sub(r"[^A-Za-z0-9_-]", "_", f"{run.name}-{checkpoint.name}")
     logged = client.create_logged_model(experiment_id, name, run_id, dict(tags), model_type="policy")
     files = store.files_at(logged.artifact_location)
     observed = [
@@ -238,9 +259,9 @@ def _log_model(
     ended_within(CALL_S, partial(files.log_artifacts, str(checkpoint), "checkpoint"))
     for key, value in metrics.items():
         # The same point as the run's own, so that its curve has no duplicate.
-        points = [point for point in client.get_metric_history(run_id, key) if point.value == value]
-        moment = (points[-1].timestamp, points[-1].step) if points else (None, None)
-        client.log_metric(run_id, key, value, *moment, model_id=logged.model_id)
+        points = [point for point in client.get_metric_history(run_id, key) if point.step == env_steps]
+        moment_ms = points[-1].timestamp if points else None
+        client.log_metric(run_id, key, value, moment_ms, env_steps, model_id=logged.model_id)
     return client.finalize_logged_model(logged.model_id, "READY")
 
 

@@ -77,7 +77,10 @@ def resolve(run: str, runs_dir: Path, tracking_uri: str | None) -> StoredRun:
 
 def _of_registered(run: str, registered: Registered, runs_dir: Path, tracking_uri: str | None) -> StoredRun:
     """Return the run of a registered checkpoint, which must be as it was; it is downloaded where it is not."""
-    places = registered.run_dir, download_folder(registered.run_dir, runs_dir)
+    recorded = registered.run_dir
+    # In runs that were copied as a whole, not in those they were copied from.
+    here = runs_dir / recorded.parent.name / recorded.name
+    places = here, recorded, download_folder(recorded, runs_dir)
     path = next((place for place in places if (place / CHECKPOINTS / registered.checkpoint).is_dir()), None)
     if path is None:
         path = fetch(registered, tracking_uri, runs_dir)
@@ -102,7 +105,8 @@ def _recorded(run: str, runs_dir: Path, tracking_uri: str | None) -> Path:
     if "run_dir" not in recorded.data.tags:
         raise BadInput(run, "has no tag run_dir, so it is not a run of deepracer-exp")
     folder = Path(recorded.data.tags["run_dir"])
-    for place in (folder, runs_dir / folder.parent.name / folder.name):
+    # In runs that were copied as a whole, not in those they were copied from.
+    for place in (runs_dir / folder.parent.name / folder.name, folder):
         # Another machine may have made a run of the same path.
         if is_run(place) and read_run_id(place) in (None, run):
             return place

@@ -6,17 +6,19 @@ from typing import TYPE_CHECKING, Any
 from deepracer_exp.config import acting
 from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.experiment import Experiment
+from deepracer_exp.config.learning import SACConfig
 from deepracer_exp.config.overrides import group_of, key_of
 from deepracer_exp.config.parse import import_own_classes, parse_experiment
 from deepracer_exp.config.stored import with_overrides
-from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, checkpoint_words, pin
+from deepracer_exp.runs.checkpoint_files import checkpoint_sha256, checkpoint_words, find_checkpoint
 from deepracer_exp.runs.lineage import Lineage, read_lineage, refuse_other_networks
 from deepracer_exp.runs.run_files import (
-    CHECKPOINTS,
+    METRICS,
     PROVENANCE,
     REWARD,
     SUMMARY,
     read_config,
+    read_metrics,
     read_object,
     read_run_id,
 )
@@ -64,14 +66,13 @@ def plan_clone(parent: StoredRun, changes: Sequence[str], *, stored: bool = Fals
 
 
 def read_parent(parent: StoredRun, clone: Experiment) -> "tuple[PolicyNetworks, Lineage]":
-    """Read a clone's initial networks and their lineage; their checkpoint is pinned.
+    """Read a clone's initial networks and their lineage.
 
     Raises:
         BadInput: the checkpoint cannot be used.
     """
     checkpoint, above = parent.read_policy(), read_lineage(parent.path)
     name = checkpoint.path.name
-    pin(parent.path / CHECKPOINTS, name, f"cloned into {clone.name}")
     return checkpoint.networks, Lineage(
         parent=parent.path.name,
         parent_dir=str(parent.path.resolve()),
@@ -96,6 +97,16 @@ def describe_clone(parent: StoredRun, clone: Experiment, lineage: Lineage) -> li
     return notes
 
 
+def _learned_alpha(parent: StoredRun) -> float | None:
+    """Return the temperature that soft actor-critic had learned at the parent's checkpoint; None: it learns none."""
+    algorithm, file = parent.experiment.algorithm, parent.path / METRICS
+    if not (isinstance(algorithm, SACConfig) and algorithm.learn_alpha and file.exists()):
+        return None
+    checkpoint = find_checkpoint(parent.checkpoints, parent.checkpoint or "best").resolve().name
+    learned = {row["iteration"]: row.get("alpha") for row in read_metrics(file)}
+    return learned.get(int(checkpoint))
+
+
 def _changed(parent: StoredRun, changes: Sequence[str], stored: bool) -> Composition:
     names = read_object(parent.path / PROVENANCE).get("names", {})
     keys = {key_of(change) for change in changes}
@@ -104,6 +115,11 @@ def _changed(parent: StoredRun, changes: Sequence[str], stored: bool) -> Composi
     composition = with_overrides(read_config(parent.path), names, [*usual, *changes], stored=stored)
     if not keys & {"algorithm", "algorithm.lr"}:
         composition.mapping["algorithm"]["lr"] = parent.experiment.algorithm.lr * SLOWER
+    if not keys & {"algorithm", "algorithm.alpha"} and (alpha := _learned_alpha(parent)) is not None:
+        composition.mapping["algorithm"]["alpha"] = alpha
+    if not keys & {"budget", "budget.schedule_until"}:
+        # That of a parent that was resumed with a larger budget; a clone's schedules follow its own.
+        composition.mapping["budget"]["schedule_until"] = 1.0
     if "runs_dir" not in keys:
         composition.mapping["runs_dir"] = str(parent.path.parent.parent)
     return composition

@@ -20,9 +20,10 @@ from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.errors import BadInput, RunFailed, count, reading
 from deepracer_exp.evaluation.rival_run import keep_rival
 from deepracer_exp.rewards.reward import RewardFunction
+from deepracer_exp.runs.checkpoint_files import pin_for_clone
 from deepracer_exp.runs.folder import RunFolder
 from deepracer_exp.runs.lineage import Lineage, read_lineage
-from deepracer_exp.runs.run_files import LINEAGE
+from deepracer_exp.runs.run_files import CHECKPOINTS, LINEAGE
 from deepracer_exp.runs.stored_run import StoredRun
 from deepracer_exp.sim.batch import CarBatch
 from deepracer_exp.tracking.metadata import joined, lineage_tags, run_params, run_tags
@@ -95,6 +96,8 @@ def begin_run(
             trainer.agent.begin_with(start[0])
         if lineage is not None:
             folder.write(LINEAGE, json.dumps(asdict(lineage), indent=2) + "\n")
+            assert plan.parent is not None
+            pin_for_clone(plan.parent.path / CHECKPOINTS, lineage.checkpoint, folder.path)
         if created is not None:
             created(folder.path)
         trainer.save(best=start is not None and lineage is None)  # of an imported run there is no other

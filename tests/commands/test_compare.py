@@ -180,6 +180,7 @@ def test_a_run_and_its_clone_are_generations(run_dir, call):
             ["first", "second", "-o", "nowhere/out.html"],
             "--output nowhere/out.html: its folder does not exist",
         ),
+        (["first", "second", "--track", "Oval_track"], "--track Oval_track: accepted with logs only"),
         (["first", "second", "--replay", "laps.mp4"], "--replay laps.mp4: accepted: the name of a page"),
         (["first", "empty"], "empty/metrics.jsonl: has no iteration"),
     ],
@@ -190,3 +191,11 @@ def test_what_cannot_be_compared_is_refused(call, tmp_path, arguments, words):
     (tmp_path / "runs" / "e" / "empty" / "metrics.jsonl").write_text("")
     call("compare", *arguments).assert_refused(words)
     assert not list(tmp_path.glob("*.html"))
+
+
+@pytest.mark.parametrize("options", [(), ("--format", "csv"), ("--replay", "laps.html")])
+def test_of_an_experiment_runs_without_an_iteration_are_left_out(call, tmp_path, options):
+    for name in ("first", "second"):
+        made_up_run(tmp_path / "runs" / "e" / name)
+    (tmp_path / "runs" / "e" / "second" / "metrics.jsonl").write_text("")
+    call("compare", "e", *options).assert_refused("e: 1 run with an iteration; accepted: two or more")

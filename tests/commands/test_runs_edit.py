@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -72,6 +73,9 @@ def test_conditions_and_an_order_hold_of_what_is_listed_in_every_format(season, 
         season.result(run, best={"eval_race_score_s": score}, laps=number)
     rows = listed(call, "--where", "score_s<9", "--sort", "score_s")
     assert [row["score_s"] for row in rows] == [7.5, 8.0]
+    # Runs without a value are the last in either order.
+    scores = [row["score_s"] for row in listed(call, "--sort", "score_s", "--reverse")]
+    assert scores == [9.0, 8.0, 7.5, None]
     assert [row["exploring_laps"] for row in listed(call, "--sort", "exploring_laps", "--reverse")] == [
         3,
         2,
@@ -98,6 +102,23 @@ def test_a_run_is_deleted_here_and_in_mlflow_only_with_yes(recorded, client, cal
     assert call("runs", "delete", recorded.name, "--yes").code == 0
     assert not recorded.exists()
     assert client.get_run(run_id).info.lifecycle_stage == "deleted"
+
+
+def test_a_copy_is_deleted_without_the_record_of_its_original(recorded, client, call):
+    copy = shutil.copytree(recorded, recorded.with_name("copy"), symlinks=True)
+    run_id = json.loads((recorded / "mlflow.json").read_text())["run_id"]
+    for folder, stage in ((copy, "active"), (recorded, "deleted")):
+        assert call("runs", "delete", folder.name, "--yes").code == 0
+        assert not folder.exists()
+        assert client.get_run(run_id).info.lifecycle_stage == stage
+
+
+def test_a_run_that_mlflow_no_longer_knows_is_deleted(recorded, client, call):
+    state = json.loads((recorded / "mlflow.json").read_text())
+    (recorded / "mlflow.json").write_text(json.dumps(state | {"run_id": "0" * 32}))
+    ended = call("runs", "delete", recorded.name, "--yes")
+    assert ended.code == 0, ended.stderr
+    assert not recorded.exists()
 
 
 @pytest.mark.parametrize("why", ["in use", "cannot be removed"])

@@ -14,7 +14,7 @@ from torchrl.checkpoint import Checkpoint
 import deepracer_exp
 from deepracer_exp.agents.ppo import PPO
 from deepracer_exp.errors import BadInput, RunFailed
-from deepracer_exp.runs.checkpoint_files import find_checkpoint, pin, verify
+from deepracer_exp.runs.checkpoint_files import find_checkpoint, pin, pin_for_clone, pinned, verify
 from deepracer_exp.runs.checkpoints import CheckpointStore, read_training
 
 from .agents import make_agent
@@ -101,6 +101,16 @@ def test_a_pinned_checkpoint_is_kept(store):
     store.rewind(0, None)
     assert names(store) == ["000000", "000002", "last", "pinned.json"]
     assert (store.folder / "last").readlink().name == "000000"
+
+
+def test_a_pin_for_a_clone_ends_with_the_clones_folder(store, tmp_path):
+    store.save(make_agent(0), {"iteration": 0}, TRAINING)
+    clone = tmp_path / "clone"
+    clone.mkdir()
+    pin_for_clone(store.folder, "000000", clone)
+    assert pinned(store.folder) == {"000000": [f"cloned into {clone}"]}
+    clone.rmdir()
+    assert pinned(store.folder) == {}
 
 
 def test_a_store_that_does_not_know_what_must_stay_removes_nothing(store, tmp_path):

@@ -105,6 +105,25 @@ def test_a_note_and_tags_that_were_removed_are_removed_in_mlflow(store, mlflow, 
     assert mlflow.get_run(run_id).data.tags["own"] == "1"
 
 
+def test_what_was_removed_while_the_store_was_away_is_removed_by_the_next_delivery(
+    run_dir, store, mlflow, tmp_path
+):
+    deliver(run_dir, store.uri, tmp_path)
+    run_id = read_run_id(run_dir)
+    deliver_labels(run_id, Labels("blue", "fast", {"car": "red"}), store.uri, tmp_path)
+    deliver(run_dir, store.uri, tmp_path)
+    assert recorded_labels(run_id, store.uri, tmp_path).tags == {}
+
+
+def test_a_run_that_the_store_does_not_know_is_delivered_anew(run_dir, store, mlflow, tmp_path):
+    deliver(run_dir, store.uri, tmp_path)
+    state = json.loads((run_dir / "mlflow.json").read_text())
+    mlflow.update_run(state["run_id"], name="another")  # so that it is not this run's
+    (run_dir / "mlflow.json").write_text(json.dumps(state | {"run_id": "0" * 32}))
+    assert deliver(run_dir, store.uri, tmp_path) > 0
+    assert read_run_id(run_dir) not in ("0" * 32, state["run_id"])
+
+
 def test_an_evaluation_and_its_film_reach_the_run_in_mlflow(run_dir, store, mlflow, tmp_path, away, caplog):
     deliver(run_dir, store.uri, tmp_path)
     film = tmp_path / "lap.mp4"

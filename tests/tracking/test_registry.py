@@ -43,6 +43,13 @@ def test_a_promoted_checkpoint_is_registered_kept_and_found_by_its_alias(season,
     check_promotion(season, client, None)
 
 
+def test_a_run_is_promoted_whatever_its_folder_is_called(season, client):
+    run = season.run("20261101-120000-oval-reward.v2 'fast'-seed0")
+    season.recorded(run, client)
+    season.promote(run)
+    assert look_up("champion", None, season.runs_dir).run_dir == run
+
+
 @pytest.mark.slow
 def test_a_server_takes_promotions_as_well(season, server):
     season.runs_dir.mkdir()

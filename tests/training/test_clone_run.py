@@ -59,6 +59,15 @@ def test_a_clone_begins_with_the_parents_best_policy_and_learns_at_a_tenth_of_it
     assert before == after
 
 
+def test_the_schedules_of_a_clone_follow_its_own_budget(parent):
+    stored = config(parent)
+    stored["budget"]["schedule_until"] = 0.5
+    (parent / "config.yaml").write_text(yaml.safe_dump(stored))
+    for changes, until in (([], 1.0), (["budget.schedule_until=0.3"], 0.3)):
+        clone = plan_clone(StoredRun(parent).with_checkpoint(), changes).experiment
+        assert clone.budget.schedule_until == until
+
+
 def test_a_clone_of_a_sweeps_trial_runs_as_a_training_does(parent):
     def clone(*changes):
         return plan_clone(StoredRun(parent).with_checkpoint(), changes).experiment

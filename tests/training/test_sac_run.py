@@ -106,6 +106,10 @@ def test_a_clone_begins_with_policy_and_critics_and_an_empty_replay(copied, call
     (clone,) = (tmp_path / "runs").glob("clone/*")
     first, second = read_metrics(clone / "metrics.jsonl")
     assert read_config(clone)["algorithm"]["lr"] == pytest.approx(read_config(run)["algorithm"]["lr"] / 10)
+    # The temperature that the parent had learned by its best checkpoint, not that it had begun with.
+    best = int((run / "checkpoints" / "best").resolve().name)
+    learned = {row["iteration"]: row["alpha"] for row in read_metrics(run / "metrics.jsonl")}
+    assert read_config(clone)["algorithm"]["alpha"] == learned[best] != read_config(run)["algorithm"]["alpha"]
     assert (first["gradient_steps"], second["gradient_steps"]) == (4, 4)
     assert (first["replay_steps"], second["replay_steps"]) == (256, 512)
     start, last = (

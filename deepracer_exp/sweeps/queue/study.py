@@ -259,7 +259,7 @@ def known_settings(request: SweepRequest, space: SearchSpace) -> list[dict[str, 
     Raises:
         BadInput: a run cannot be found, or a key or a value is not searched.
     """
-    return [_setting(entry, space, request.runs_dir) for entry in request.entry.sweep.enqueue]
+    return [_setting(entry, space, request) for entry in request.entry.sweep.enqueue]
 
 
 def enqueue(study: Study, settings: Sequence[Mapping[str, Choice]]) -> None:
@@ -275,12 +275,12 @@ def _trial_of(run: Path) -> Path:
     return run.with_name(lineage.parent) if lineage is not None and of_last_stage else run
 
 
-def _setting(entry: Mapping[str, Any] | str, space: SearchSpace, runs_dir: Path) -> dict[str, Choice]:
+def _setting(entry: Mapping[str, Any] | str, space: SearchSpace, request: SweepRequest) -> dict[str, Choice]:
     axes = {axis.key: axis for axis in space.dimensions}
     where = f"sweep.enqueue={entry}"
     plain: Mapping[str, Any]
     if isinstance(entry, str):
-        values = read_config(_trial_of(resolve(entry, runs_dir, None).path))
+        values = read_config(_trial_of(resolve(entry, request.runs_dir, request.tracking_uri).path))
         # A run has the values of an option, not its name.
         plain = {key: value for key in axes if key not in groups() for value in value_at(values, key)}
     else:

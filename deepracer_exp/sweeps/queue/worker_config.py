@@ -14,6 +14,8 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.sweep import SweepConfig
 from deepracer_exp.errors import BadInput
+from deepracer_exp.runs.checkpoint_files import pin
+from deepracer_exp.runs.run_files import CHECKPOINTS
 from deepracer_exp.runs.stored_run import StoredRun
 from deepracer_exp.sweeps.search.space import SearchSpace
 from deepracer_exp.tracking.resolve import resolve
@@ -33,15 +35,16 @@ class Parent:
     checkpoint: int
 
     @classmethod
-    def find(cls, run: str, study: str, runs_dir: Path) -> Self:
+    def find(cls, run: str, study: str, runs_dir: Path, uri: str | None) -> Self:
         """Return the parent that a study's `parent=RUN` means now; its checkpoint is pinned.
 
         Raises:
             BadInput: the run or its checkpoint cannot be used.
         """
         try:
-            parent = resolve(run, runs_dir, None).with_checkpoint()
+            parent = resolve(run, runs_dir, uri).with_checkpoint()
             _, lineage = read_parent(parent, plan_clone(parent, [f"name={study}"]).experiment)
+            pin(parent.path / CHECKPOINTS, lineage.checkpoint, f"cloned by the study {study}")
         except BadInput as error:
             raise BadInput(f"parent={run}", error.without(run)) from error
         return cls(lineage.parent_dir, int(lineage.checkpoint))
