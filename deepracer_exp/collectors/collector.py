@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, wait
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -62,6 +63,9 @@ class Collector:
 
         `frames_per_batch` is in control steps over all cars, and is rounded up to whole steps of all cars.
         """
+        if state and config.forks and config.processes is None:
+            # Of a run that continues on a machine with another number of cores.
+            config = replace(config, processes=len(state))
         self._policy = SamplingPolicy(policy)
         self._workers = worker_count(config)
         self._steps = steps_per_batch(config, frames_per_batch)

@@ -2,7 +2,7 @@
 
 import ast
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,7 +28,7 @@ class RewardSource:
 
 
 def keeps_state(source: RewardSource) -> bool:
-    """Return whether a function that a training calls assigns to a variable of its module, or into one."""
+    """Return whether a function that a training calls changes a variable of its module, or an object in one."""
     module = ast.parse(source.text)
     functions = {node.name: node for node in module.body if isinstance(node, ast.FunctionDef)}
     called = [name for name in sorted(functions) if name in ("reward_batch", "reward_function")][:1]
@@ -42,17 +42,45 @@ def keeps_state(source: RewardSource) -> bool:
         for node in ast.walk(statement)
         if isinstance(node, ast.ClassDef) or (isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store))
     }
-    return any(
-        isinstance(node, ast.Global)
-        or (
-            isinstance(node, ast.Attribute | ast.Subscript)
-            and isinstance(node.ctx, ast.Store)
-            and isinstance(node.value, ast.Name)
-            and node.value.id in bound
-        )
-        for name in called
-        for node in ast.walk(functions[name])
+    made = {name for statement in module.body for name in _made_of(statement)}
+    methods = [
+        node
+        for statement in module.body
+        if isinstance(statement, ast.ClassDef) and statement.name in made
+        for node in statement.body
+        if isinstance(node, ast.FunctionDef) and node.name != "__init__"
+    ]
+    return any(_changes(functions[name], bound) for name in called) or any(
+        _changes(method, bound | {argument.arg for argument in method.args.args[:1]}) for method in methods
     )
+
+
+_CHANGING = ("add", "append", "clear", "extend", "insert", "pop", "popleft", "remove", "setdefault", "update")
+"""Methods that change a list, a set or a mapping."""
+
+
+def _made_of(statement: ast.stmt) -> Iterator[str]:
+    """Return the names of what a module's statement calls, outside functions and classes."""
+    if not isinstance(statement, ast.FunctionDef | ast.ClassDef):
+        for node in ast.walk(statement):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+                yield node.func.id
+
+
+def _changes(function: ast.FunctionDef, bound: Collection[str]) -> bool:
+    """Return whether a function assigns to one of these names' values, or into one, or changes one by a method."""
+    for node in ast.walk(function):
+        if isinstance(node, ast.Global):
+            return True
+        stores = isinstance(node, ast.Attribute | ast.Subscript) and isinstance(node.ctx, ast.Store)
+        calls = isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load) and node.attr in _CHANGING
+        if stores or calls:
+            root: ast.AST = node
+            while isinstance(root, ast.Attribute | ast.Subscript):
+                root = root.value
+            if isinstance(root, ast.Name) and root.id in bound:
+                return True
+    return False
 
 
 _ZOO = "reward_zoo"

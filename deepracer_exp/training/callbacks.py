@@ -110,7 +110,7 @@ class EvalCallback(Callback):
 
     def _evaluate(self, trainer: Trainer) -> None:
         assert self._evaluator is not None
-        rival = None if trainer.rivals is None else trainer.rivals.newest_policy()
+        rival = None if trainer.rivals is None else trainer.rivals.newest_policy(trainer.iteration)
         trainer.evaluation = self._evaluator(trainer.networks.policy, rival=rival)
         trainer.row |= eval_columns(trainer.evaluation)
 

@@ -11,7 +11,7 @@ from deepracer_exp.config.parse import import_own_classes, parse_experiment
 from deepracer_exp.config.stored import with_overrides
 from deepracer_exp.env.race_files import RaceFiles, read_race_files
 from deepracer_exp.env.real_car import require_car
-from deepracer_exp.evaluation.rival_run import find_rival
+from deepracer_exp.evaluation.rival_run import find_rival, kept_rival
 from deepracer_exp.runs.run_files import PROVENANCE, read_config, read_object
 from deepracer_exp.runs.stored_run import StoredRun
 
@@ -49,7 +49,9 @@ def plan_training(
         require_car(experiment, "randomization.real_car")
     runs_dir, uri = Path(experiment.runs_dir), getattr(experiment.tracking, "uri", None)
     rivals = experiment.race.rivals
-    if rivals is not None and not rivals.is_own:
+    if parent is not None and rivals == parent.experiment.race.rivals:
+        rival = kept_rival(parent.experiment, parent.path)
+    elif rivals is not None and not rivals.is_own:
         rival = find_rival("race.rivals.policy", rivals.policy, rivals.checkpoint, experiment, runs_dir, uri)
     return TrainPlan(experiment, composition, files, rival, parent)
 

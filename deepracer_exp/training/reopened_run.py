@@ -143,7 +143,7 @@ def _moved_schedules(trainer: Trainer, plan: ResumePlan) -> str | None:
     (_, used_before), (limit, used_now) = (budget.used(*trainer.usage) for budget in budgets)
     held = schedule_until(before.schedule_until * used_now / used_before)
     return (
-        f"budget.{limit}={getattr(now, limit):g}: with this budget the {' and the '.join(moved)}; add {held} to hold "
+        f"budget.{limit}={getattr(now, limit)}: with this budget the {' and the '.join(moved)}; add {held} to hold "
         "the schedule of the run"
     )
 

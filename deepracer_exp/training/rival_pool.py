@@ -57,9 +57,10 @@ class RivalPool:
         """Return the rivals in a form that workers take."""
         return replace(self._rivals, weights=self.driving)
 
-    def newest_policy(self) -> torch.nn.Module:
-        """Return the newest rival."""
-        (policy,) = self._rivals.policies(self.driving[-1:])
+    def newest_policy(self, before: int) -> torch.nn.Module:
+        """Return the newest rival that is no snapshot of this iteration's policy, if there is one."""
+        older = [number for number in self.weights if number < before] or [*self.weights]
+        (policy,) = self._rivals.policies([self.weights[older[-1]]])
         return policy
 
     def take(self, iteration: int) -> bool:

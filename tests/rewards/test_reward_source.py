@@ -167,6 +167,20 @@ def test_a_function_of_the_zoo_is_known_by_its_text_whatever_its_constants() -> 
             "def reward_function(params):\n    return gained(params)\n",
             True,
         ),
+        ("history = []\ndef reward_function(params):\n    history.append(1)\n    return 1.0\n", True),
+        ("_last = {'a': {}}\ndef reward_function(params):\n    _last['a']['b'] = 1\n    return 1.0\n", True),
+        ("import numpy as np\ndef reward_function(params):\n    return float(np.append(1, 2)[0])\n", False),
+        (
+            "class Reward:\n    def __init__(self):\n        self.last = 0\n"
+            "    def reward_function(self, params):\n        self.last = params['x']\n        return 1.0\n"
+            "made = Reward()\ndef reward_function(params):\n    return made.reward_function(params)\n",
+            True,
+        ),
+        (
+            "class Reward:\n    def pay(self, params):\n        self.last = params['x']\n        return 1.0\n"
+            "def reward_function(params):\n    return Reward().pay(params)\n",
+            False,
+        ),
         # A training calls the batch alone.
         (
             "_last = {}\ndef reward_function(params):\n    _last['x'] = 1.0\n    return 1.0\n"

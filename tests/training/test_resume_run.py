@@ -10,6 +10,7 @@ import torch
 import yaml
 
 from deepracer_exp.agents.ppo import PPO
+from deepracer_exp.collectors import collector
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.errors import RunFailed
@@ -23,7 +24,7 @@ from deepracer_exp.training.plan import plan_training
 from deepracer_exp.training.run import run_training
 from deepracer_exp.training.train_result import TakenOver
 from deepracer_exp.training.trainer import Trainer
-from tests.conftest import IN_PROCESS, OFTEN, POOL, THREE
+from tests.conftest import IN_PROCESS, IN_WORKERS, OFTEN, POOL, THREE
 from tests.waiting import wait_until
 
 from .conftest import assert_same_run
@@ -77,6 +78,23 @@ def test_a_run_that_continues_is_the_run_that_was_never_interrupted(trained, cut
     assert_same_run(run, whole(trained, *overrides))
     assert summary(run)["iteration"] == 6
     assert "will not be that of an uninterrupted run" not in ended.stderr
+
+
+@pytest.mark.usefixtures("workers_start_early")
+def test_a_run_continues_on_a_machine_with_fewer_cores(call, tmp_path, monkeypatch):
+    def trained(name: str, *words: str):
+        ended = call(*words, *OFTEN, "budget.env_steps=null", f"name={name}")
+        assert ended.code == 0, ended.stderr
+        (folder,) = (tmp_path / "runs" / name).iterdir()
+        return folder
+
+    new = ("train", *IN_WORKERS, "collector.processes=null", "collector.cars=16")
+    monkeypatch.setattr(collector, "cores", lambda: 2)
+    whole, run = trained("whole", *new, "budget.iterations=4"), trained("cut", *new, "budget.iterations=2")
+    monkeypatch.setattr(collector, "cores", lambda: 1)
+    ended = call("resume", str(run), "budget.iterations=4")
+    assert ended.code == 0, ended.stderr
+    assert_same_run(run, whole)
 
 
 SCHEDULED = ("lr_schedule=linear", "algorithm.entropy_end_factor=0.1")

@@ -1,12 +1,17 @@
 """Training against rivals: the pool of snapshots, another run as the rival, and what is refused."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
-from deepracer_exp.runs.checkpoints import check, read_training
+from deepracer_exp.env.setup import build_setup
+from deepracer_exp.runs.checkpoints import check, read_checkpoint, read_training
 from deepracer_exp.runs.run_files import read_metrics
+from deepracer_exp.runs.stored_run import StoredRun
+from deepracer_exp.training.rival_pool import RivalPool
 from tests.conftest import IN_WORKERS, OFTEN, POOL, RACE, THREE
 
 from .conftest import assert_same_run
@@ -24,6 +29,21 @@ def test_snapshots_are_taken_at_intervals_and_the_oldest_go(trained):
     assert snapshots(run) == [0, 4]
     won = [row.get("eval_won") for row in read_metrics(run / "metrics.jsonl")]
     assert [value is None for value in won] == [True, False] * 3
+
+
+def test_a_policy_is_judged_against_an_older_one_than_itself(trained):
+    run = StoredRun(trained(*OFTEN, *POOL, *SIX).folder)
+    experiment = run.experiment
+    first, last = (read_checkpoint(experiment, run.checkpoints, name).networks for name in ("000002", "last"))
+    policies = first.policy, last.policy
+    often = replace(experiment.race.rivals, snapshot_every=1)
+    pool = RivalPool(often, build_setup(experiment), policies[0], None)
+    pool.take(4)
+    pool._learner = policies[1]
+    pool.take(5)
+    for before, wanted in ((6, policies[1]), (5, policies[0]), (4, policies[1])):
+        found, expected = pool.newest_policy(before).state_dict(), wanted.state_dict()
+        assert all(torch.equal(found[name], value) for name, value in expected.items()), before
 
 
 def test_the_rival_decides_what_is_learned(trained):

@@ -181,6 +181,8 @@ def _rows(iterations: "pd.DataFrame") -> Iterator[Row]:
     table = {
         # The race score is in the metrics of our own runs alone.
         "eval_race_score_s": iterations["eval_lap_time_s"].where(reliable),
+        "eval_lap_time_s": iterations["eval_lap_time_s"],
+        "eval_lap_share": iterations["eval_lap_share"],
         "completion": iterations["completion_mean"],
         "mean_return": iterations["reward_mean"],
         "entropy": iterations["entropy"],
