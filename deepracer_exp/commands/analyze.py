@@ -43,6 +43,7 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         commands,
         "analyze",
         _analyze,
+        entry=None,
         help="find out from logs how a training went",
         description="Read the logs of a training, ours or the service's of any year, print the findings, and write a "
         "page of figures.",

@@ -4,8 +4,11 @@ import argparse
 import ctypes.util
 import os
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import yaml
 
 from deepracer_exp.errors import BadInput
 
@@ -117,9 +120,15 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 def _evaluate(args: argparse.Namespace) -> int:
     if args.cfg:
+        runs, overrides = runs_and_overrides(args)
+        if runs:  # by whose protocol it is judged unless another is named
+            config = asdict(_planned(args, *run_and_overrides(args)).config)
+            print(yaml.safe_dump(config, sort_keys=False, default_flow_style=None, width=110), end="")
+            return 0
+
         from deepracer_exp.config.compose import compose_evaluation
 
-        print(compose_evaluation(runs_and_overrides(args)[1])[1].yaml(), end="")
+        print(compose_evaluation(overrides)[1].yaml(), end="")
         return 0
     run, overrides = run_and_overrides(args)
     check_file("--video", args.video, ".mp4")

@@ -318,7 +318,11 @@ def _show_study(word: str, *arguments: str) -> int:
 
     with reading(f"sweep {word} {names[0]}"):
         safe_name(names[0])
-    runs_dir, storage = stores.runs_dir, stores.values.get("sweep.storage")
+    from deepracer_exp.config.sweep import compose_sweep
+
+    given = [word for word in arguments if word.startswith("sweep.storage=")]
+    # Composed, because the address may be in a variable of the environment.
+    runs_dir, storage = stores.runs_dir, compose_sweep(given).entry.sweep.storage
     if storage is None and not (runs_dir / DEFAULT_FILE).is_file():
         raise BadInput(f"runs_dir={runs_dir}: has no {DEFAULT_FILE}; give runs_dir=DIR or sweep.storage=URL")
 

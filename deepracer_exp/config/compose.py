@@ -38,6 +38,8 @@ Config = TypeVar("Config")
 MOST_RUNS = 1000
 """Limit of one `-m`: this many runs in sequence take a day."""
 
+_COURSE = ("name", "title", "file", "knots", "width_m", "closed")
+"""Keys of a track that say which one it is."""
 _FILES = (".json", ".npy", ".py", ".yaml", ".yml")
 _NO_EXPERIMENT = ("experiment", None)
 
@@ -127,10 +129,17 @@ def compose_entry(entry: str, overrides: Sequence[str]) -> Composition:
         chosen = [override for override in chosen if override.key_or_group != TRACK]
     with reading(" ".join(overrides) or entry):
         config, choices = composed(entry, [_choice(override) for override in chosen])
+        unfit = [
+            *_leave_out_of_other_algorithm(config, choices),
+            *_stays_beside(entry, config, choices, chosen),
+        ]
         if names:
+            on_each = _changed_by_experiment(entry, config, choices, chosen, TRACK)
             config[TRACK] = {name: composed_option(TRACK, name) for name in names}
+            for name, (key, value) in itertools.product(names, on_each.items()):
+                if key not in _COURSE:
+                    OmegaConf.update(config[TRACK][name], key, value)
             choices[TRACK] = f"[{','.join(names)}]"
-        unfit = _leave_out_of_other_algorithm(config, choices)
         try:
             for override in changing:
                 if _is_taken_for_a_group(config, override) or not change(config, override):
@@ -165,6 +174,40 @@ def _leave_out_of_other_algorithm(config: DictConfig, choices: Mapping[str, str]
     return (
         [f"experiment={experiment}: {what}: not used with algorithm={choices['algorithm']}"] if unfit else []
     )
+
+
+def _stays_beside(
+    entry: str, config: DictConfig, choices: Mapping[str, str], chosen: Sequence[Override]
+) -> list[str]:
+    """Return a line for each chosen option of which a chosen experiment changes values."""
+    lines = []
+    for group in (override.key_or_group for override in chosen if override.key_or_group in choices):
+        changed = _changed_by_experiment(entry, config, choices, chosen, group)
+        kept = ", ".join(override_line(f"{group}.{key}", value) for key, value in changed.items())
+        if kept:
+            lines.append(f"experiment={choices['experiment']}: {kept} stays beside {group}={choices[group]}")
+    return lines
+
+
+def _changed_by_experiment(
+    entry: str, config: DictConfig, choices: Mapping[str, str], chosen: Sequence[Override], group: str
+) -> dict[str, Any]:
+    """Return the values of a group, by key, that a chosen experiment gives in place of those of the chosen option."""
+    if choices.get("experiment") is None or group == "experiment":
+        return {}
+    others = [_choice(override) for override in chosen if override.key_or_group not in ("experiment", group)]
+    before, now = composed(entry, [*others, override_line(group, choices[group])])[0], config[group]
+    keys = [
+        key
+        for key in _dotted(OmegaConf.to_container(now))
+        if not OmegaConf.is_dict(OmegaConf.select(now, key))
+    ]
+    values = {key: OmegaConf.select(now, key) for key in keys}
+    return {
+        key: OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
+        for key, value in values.items()
+        if value != OmegaConf.select(before[group], key)
+    }
 
 
 def _choice(override: Override) -> str:
@@ -220,8 +263,11 @@ def check_choice(group: str, value: object) -> None:
     # Only `experiment` may be left out of the groups; `several_tracks` checks lists of tracks.
     if (group, value) in (_NO_EXPERIMENT, (TRACK, ALL)) or (group == TRACK and isinstance(value, list)):
         return
-    for name in value if isinstance(value, list) else [value]:
-        check_option(group, name)
+    if isinstance(value, list):
+        raise BadInput(
+            override_line(group, value), "several options", f"one; -m {group}=A,B makes a run of each"
+        )
+    check_option(group, value)
 
 
 def check_names(evaluation: EvaluationConfig) -> None:

@@ -100,6 +100,8 @@ class OptionFiles(ConfigSource):
 
         def load(text: str) -> ConfigResult:
             config, package = copy.deepcopy(_parsed(text)), _PACKAGE.match(text)
+            if group == "experiment" and package is None:
+                raise ValueError("lacks its first line, # @package _global_")
             if group == TRACK and "defaults" not in config:
                 config = track_values(option, config)
             return ConfigResult(self.provider, self.full_path(), config, {"package": package and package[1]})

@@ -195,7 +195,10 @@ def _decided(view: LogView, decision: Mapping[str, Any]) -> Finding:
         if rule == "collapsed":
             is_sac = "sac_alpha" in (view.recording.hyperparameters or {})
             bonus = (
-                "temperature (algorithm.alpha)" if is_sac else "entropy coefficient (algorithm.entropy_coeff)"
+                "entropy that the temperature aims at (algorithm.target_entropy, for a list of actions "
+                "algorithm.target_entropy_share; without learn_alpha the temperature, algorithm.alpha)"
+                if is_sac
+                else "entropy coefficient (algorithm.entropy_coeff)"
             )
             advice = (
                 f"Raise the {bonus} or lower the learning rate (algorithm.lr): "

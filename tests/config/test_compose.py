@@ -42,6 +42,45 @@ def test_values_override_a_chosen_experiment():
     )
 
 
+def test_what_an_experiment_keeps_of_a_chosen_option_is_said():
+    experiment, composition = compose_experiment(["experiment=sliding_car", "network=mlp_small"])
+    (note,) = (note for note in composition.notes if "stays beside" in note)
+    hidden = list(experiment.network.hidden)
+    assert hidden != list(compose_experiment(["network=mlp_small"])[0].network.hidden)
+    assert note.startswith("experiment=sliding_car: ")
+    assert f"network.hidden={hidden}".replace(" ", "") in note.replace(" ", "")
+    assert note.endswith("stays beside network=mlp_small")
+    assert compose_experiment(["experiment=sliding_car"])[1].notes == ()
+    assert compose_experiment(["experiment=tiny", "track=Oval_track"])[1].notes == ()
+
+
+def test_what_an_experiment_says_of_its_track_holds_on_each_of_several(own_experiment):
+    own_experiment(
+        "defaults: [{override /track: Oval_track}]\ntrack: {floor: {friction: 0.7}, direction: alternate}\n"
+    )
+    tracks = compose_experiment(["experiment=wet", "track=[reinvent_base,AWS_track]"])[0].tracks
+    assert [*tracks] == ["reinvent_base", "AWS_track"]
+    assert {(track.floor.friction, track.direction) for track in tracks.values()} == {(0.7, "alternate")}
+
+
+def test_an_experiment_without_its_first_line_is_named(own_experiment):
+    own_experiment("seed: 3\n", first_line="")
+    with pytest.raises(BadInput, match=r"wet\.yaml.*lacks its first line, # @package _global_"):
+        compose_experiment(["experiment=wet"])
+
+
+@pytest.fixture
+def own_experiment(here):
+    """Write an experiment of one's own, `wet`."""
+
+    def write(text: str, first_line: str = "# @package _global_\n") -> None:
+        folder = here / "conf" / "experiment"
+        folder.mkdir(parents=True)
+        (folder / "wet.yaml").write_text(first_line + text)
+
+    return write
+
+
 @pytest.mark.parametrize("prefix", ["", "+", "++"])
 def test_a_constant_of_the_reward_needs_no_plus(prefix):
     experiment, _ = compose_experiment([f"{prefix}reward.constants.PROGRESS_WEIGHT=2.5"])
@@ -106,6 +145,7 @@ def test_quotes_home_and_environment_variables_are_understood(monkeypatch, tmp_p
         ("track=Ovaltrack", ["track=Ovaltrack", "did you mean Oval_track?"]),
         ("experiment=tyni", ["experiment=tyni", "did you mean tiny?"]),
         ("network=3", ["network=3: no such network", "mlp_small"]),
+        ("reward=[racing_line,follow_center_line]", ["several options; accepted: one; -m reward=A,B"]),
         ("track={a:1}", ["no such track", "`deepracer-exp train --options track` lists them"]),
         ("device=gpu", ['device="gpu"', "accepted: cpu, cuda"]),
         ("sed=1", ["sed: no such key (did you mean seed?)"]),

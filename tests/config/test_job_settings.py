@@ -79,6 +79,18 @@ def test_a_folder_of_deepracer_for_cloud_trains_on_its_track_from_its_starts(drf
     )
 
 
+def test_keys_of_earlier_versions_count_where_the_new_ones_are_missing(drfc):
+    folder = drfc({"DR_CHANGE_START_POSITION": "False", "DR_ALTERNATE_DRIVING_DIRECTION": "True"})
+    experiment, _ = composed(folder)
+    assert (experiment.episode.start_advance > 0, experiment.track.direction) == (True, "forward")
+    lines = (folder / "run.env").read_text().splitlines()
+    new = ("DR_TRAIN_CHANGE", "DR_TRAIN_ALTERNATE", "DR_TRAIN_ROUND")
+    (folder / "run.env").write_text("\n".join(line for line in lines if not line.startswith(new)))
+    experiment, notes = composed(folder)
+    assert (experiment.episode.start_advance, experiment.track.direction) == (0.0, "alternate")
+    assert not any("DR_CHANGE_START_POSITION" in note for note in notes)
+
+
 @pytest.mark.parametrize(
     ("key", "value", "attribute", "expected"),
     [

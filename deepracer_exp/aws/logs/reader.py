@@ -136,7 +136,7 @@ class _Assembly:
             checkpoints_counted=bool(counted) and not named and not stored,
             model_checkpoints=stored,
             rounds=tuple(rounds) if len(rounds) > 1 else (),
-            race=parts.races.get(TRAINING) or next(iter(parts.races.values()), {}),
+            race=parts.races[TRAINING] if TRAINING in parts.races else next(iter(parts.races.values()), {}),
         )
 
     def _training_rows(self) -> tuple[list[Rows], Numbers, dict[int, int]]:

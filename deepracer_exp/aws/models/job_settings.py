@@ -24,6 +24,11 @@ ENV_KEYS = {
 
 The last two are of run.env alone.
 """
+_OLD_ENV_KEYS = {
+    "DR_CHANGE_START_POSITION": "DR_TRAIN_CHANGE_START_POSITION",
+    "DR_ALTERNATE_DRIVING_DIRECTION": "DR_TRAIN_ALTERNATE_DRIVING_DIRECTION",
+}
+"""Keys of earlier versions of deepracer-for-cloud, which it still reads, and those that took their place."""
 OA_KEYS = {
     "NUMBER_OF_OBSTACLES": "DR_OA_NUMBER_OF_OBSTACLES",
     "MIN_DISTANCE_BETWEEN_OBSTACLES": "DR_OA_MIN_DISTANCE_BETWEEN_OBSTACLES",
@@ -103,6 +108,9 @@ def read_run_env(path: str) -> JobSettings:
     Source of the rules: deepracer-for-cloud, scripts/training/prepare-config.py.
     """
     values = _read_env(path)
+    for old, key in _OLD_ENV_KEYS.items():
+        if old in values:
+            values.setdefault(key, values.pop(old))
     return _settings(path, values, ENV_KEYS, tuple(values))
 
 

@@ -92,7 +92,8 @@ def object_columns(
         np.tile(placement.lanes, (n, 1)),
         np.full(n, placement.seed, np.uint64),
     )
-    _, columns = others.judge(result)
+    # At the beginning of the episode: later the bots would have driven on from where they are placed.
+    _, columns = others.judge(result, np.zeros(n))
     return columns
 
 

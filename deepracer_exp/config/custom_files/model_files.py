@@ -228,6 +228,8 @@ def read_custom_files(folder: str) -> CustomFiles:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise BadInput(f"{KEY} {folder}", f"cannot be read ({reason})", accepted) from error
     unused = _experiments(folder)
+    if "training_params.yaml" in names:
+        unused.append("training_params.yaml: not used; `deepracer-exp import` reads it, or give track=NAME")
     job = read_run_env(str(Path(folder, "run.env"))) if "run.env" in names else None
     paths, left = {}, {}
     for name, places in PLACES.items():

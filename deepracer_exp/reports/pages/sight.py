@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter
 from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import TanhNormal
 
 from deepracer_exp.config.driving import CameraConfig
 from deepracer_exp.env.action_space import ActionSpace
@@ -55,17 +56,22 @@ def saliency(policy: nn.Module, acted: TensorDict, camera: CameraConfig) -> NDAr
             mixed = pixels + (blurred - pixels) * masks[:, None] * of_eye
             seen = acted.expand(places + 1).clone()
             seen["pixels"] = torch.cat([pixels[None], mixed]).round().byte()
-            decided = _decision(policy(seen), acted)
+            decided = _decision(policy(seen), acted, is_squashed(policy))
             scores[eye] = 0.5 * (decided[1:] - decided[0]).square().sum(-1)
     weighted = (torch.einsum("ep,phw->ehw", scores, masks) / masks.sum(0)).numpy()
     beside = np.concatenate(list(weighted), axis=1)
     return (beside / max(float(beside.max()), 1e-12)).astype(np.float32)
 
 
-def _decision(out: TensorDict, acted: TensorDict) -> Tensor:
+def is_squashed(policy: nn.Module) -> bool:
+    """Return whether a policy's continuous actions are the hyperbolic tangents of its normal distribution, as SAC's."""
+    return any(getattr(module, "distribution_class", None) is TanhNormal for module in policy.modules())
+
+
+def _decision(out: TensorDict, acted: TensorDict, squashed: bool) -> Tensor:
     """Return the values by which decisions are compared, [..., 1 or 2]."""
     if "loc" in out:
-        return out["loc"]
+        return out["loc"].tanh() if squashed else out["loc"]
     return out["logits"].log_softmax(-1)[..., acted["action"].item(), None]
 
 

@@ -30,7 +30,7 @@ from deepracer_exp.sim.lidar_rays import ANGLES_RAD, MOUNT_X_M
 from deepracer_exp.sim.scenery import box_corners
 from deepracer_exp.tracks.outline import draw_track, extent
 
-from .sight import degrees, picture_of, saliency, under_heat
+from .sight import degrees, is_squashed, picture_of, saliency, under_heat
 
 WIDTH, HEIGHT = 1280, 720
 _EYE = (480, 360)
@@ -67,7 +67,7 @@ class Frames:
         self._decision: _Probabilities | _Distribution = (
             _Probabilities(actions, acted["logits"].softmax(-1).numpy(), WIDTH - self._left)
             if isinstance(actions, DiscreteActions)
-            else _Distribution(actions.low, actions.high, WIDTH - self._left)
+            else _Distribution(actions.low, actions.high, WIDTH - self._left, is_squashed(policy))
         )
         lidar, room = observation.lidar, (WIDTH - self._left, HEIGHT - _BOARD_HEIGHT - _ACTIONS_HEIGHT)
         seen = None if lidar is None else rays(lap, acted["lidar"].numpy(), lidar, car.front_point_m)
@@ -246,16 +246,21 @@ class _Probabilities:
 class _Distribution:
     """Mean and standard deviation of steering and speed, on the ranges of a continuous action space."""
 
-    def __init__(self, low: NDArray[np.float64], high: NDArray[np.float64], width: int) -> None:
+    def __init__(
+        self, low: NDArray[np.float64], high: NDArray[np.float64], width: int, squashed: bool
+    ) -> None:
         self._low, self._high, self._width = low, high, width
+        self._squashed = squashed
 
     def draw(self, row: int, acted: TensorDict) -> Image.Image:
         """Return the two scales."""
         image = Image.new("RGB", (self._width, _ACTIONS_HEIGHT), _PAGE)
         draw = ImageDraw.Draw(image)
         half = 0.5 * (self._high - self._low)
-        means = self._low + half * (acted["loc"].numpy().clip(-1, 1) + 1)
-        deviations = half * acted["scale"].numpy()
+        loc, scale = acted["loc"].numpy(), acted["scale"].numpy()
+        means = self._low + half * ((np.tanh(loc) if self._squashed else loc.clip(-1, 1)) + 1)
+        # Where the values are squashed, their spread is too: half of what a deviation to either side changes.
+        deviations = half * (0.5 * (np.tanh(loc + scale) - np.tanh(loc - scale)) if self._squashed else scale)
         draw.text((24, 8), "mean and standard deviation", font=font_of(15), fill=_FAINT)
         begin, end = 24, self._width - 24
         for row, (name, unit, digits) in enumerate((("steering", "°", 1), ("speed", " m/s", 2))):

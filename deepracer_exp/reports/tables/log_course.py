@@ -289,8 +289,8 @@ def driven_against(course: Track, steps: pd.DataFrame, episode: NDArray[np.int64
     course's own direction.
     """
     within = np.arange(len(episode)) - np.searchsorted(episode, episode)
-    known = np.isfinite(steps[["X", "Y", "progress"]].to_numpy()).all(axis=1)
-    rows = np.flatnonzero(known & (within < _DIRECTION_ROWS))
+    finite = np.isfinite(steps[["X", "Y", "progress"]].to_numpy()).all(axis=1)
+    rows = np.flatnonzero(finite & (within < _DIRECTION_ROWS))
     along = progress_along(course, steps.iloc[rows], episode[rows])
     sums = np.bincount(episode[rows], along, minlength=int(episode.max(initial=0)) + 1)
     return (sums < 0)[episode]

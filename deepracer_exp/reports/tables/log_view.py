@@ -35,7 +35,9 @@ from .tables import candidates, episode_table, iteration_table
 
 DISCOUNT = Hyperparameters().discount_factor
 """Discount of logs without hyperparameters: the service's default."""
-ONE_WAY = "track.direction=alternate: episodes driven the other way are left out"
+ONE_WAY = "driven in both directions: the episodes against that of the first ones are left out"
+_ALTERNATES = 0.1
+"""Share of rows driven against the course beyond which a training alternates: no car drives back that often."""
 PREPARE = "prepare"
 """Status of the row in which an episode starts, before the first action."""
 LEAST_LAPS = 5
@@ -345,12 +347,13 @@ def prepare(log: Recording | RunRecording | EvaluationRecording, track: str | No
         course = directed(catalogue_track(track), catalogue_track(track, True), driven_on)
         if course_now is not None and not was_driven_on(course, driven_on):
             raise BadInput(recording.name, f"track={track} was not driven on", course_now.name)
-    if course is not None and run is not None and name in run.alternating:
-        along = ~driven_against(course, driven_on, driven_on["episode"].to_numpy(np.int64))
-        kept, driven_on = np.flatnonzero(here)[along], driven_on[along]
-        here = np.zeros(len(steps), bool)
-        here[kept] = True
-        problems = (*problems, LogProblem(recording.name, None, ONE_WAY))
+    if course is not None:
+        against = driven_against(course, driven_on, np.cumsum(first_rows(driven_on)) - 1)
+        if against.mean() > _ALTERNATES:
+            kept, driven_on = np.flatnonzero(here)[~against], driven_on[~against]
+            here = np.zeros(len(steps), bool)
+            here[kept] = True
+            problems = (*problems, LogProblem(recording.name, None, ONE_WAY))
     course = estimated_course(name, driven_on) if course is None else numbered_as_logged(course, driven_on)
     recording = _on_course(recording, here & training)
     discount = float((recording.hyperparameters or {}).get("discount_factor", DISCOUNT))
