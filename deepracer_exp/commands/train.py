@@ -320,9 +320,9 @@ def _show_study(word: str, *arguments: str) -> int:
         safe_name(names[0])
     from deepracer_exp.config.sweep import compose_sweep
 
-    given = [word for word in arguments if word.startswith("sweep.storage=")]
+    addresses = [word for word in arguments if word.startswith("sweep.storage=")]
     # Composed, because the address may be in a variable of the environment.
-    runs_dir, storage = stores.runs_dir, compose_sweep(given).entry.sweep.storage
+    runs_dir, storage = stores.runs_dir, compose_sweep(addresses).entry.sweep.storage
     if storage is None and not (runs_dir / DEFAULT_FILE).is_file():
         raise BadInput(f"runs_dir={runs_dir}: has no {DEFAULT_FILE}; give runs_dir=DIR or sweep.storage=URL")
 
