@@ -132,6 +132,8 @@ def _terms(config: Mapping[str, Any], result: RunResult) -> dict[str, Any]:
         "what they are ranked by": result.measure,
         "car": config.get("car"),
         **({"evaluation": evaluation} if result.evaluated else {}),
+        # An evaluation without a race of its own has that of the training.
+        **({"race": config.get("race")} if result.evaluated and evaluation.get("race") is None else {}),
         **({} if courses else {"track": config.get("track")}),
     }
 

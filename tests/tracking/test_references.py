@@ -50,6 +50,7 @@ def test_the_best_of_an_experiment_is_its_run_of_the_highest_rank(season, result
         ({"track": {"name": "oval", "knots": [3]}}, "lap_time", "track.knots is [1, 2] in 1 and [3] in 2"),
         ({"car": {"name": "ideal"}}, "lap_time", "car is deepracer in 1 and ideal in 2"),
         ({"evaluation": {"trials": 1, "tracks": None}}, "lap_time", "evaluation is"),
+        ({"race": {"boxes": {"number": 6}}}, "lap_time", "race is null in 1"),
         ({}, "progress", "what they are ranked by is lap_time in 1 and progress in 2"),
     ],
 )

@@ -99,11 +99,11 @@ def sentences(groups: Sequence[RunGroup], comparisons: Sequence[Comparison]) -> 
     lacking = sum(result is None or not result.evaluated for result in results)
     if lacking:
         lines.append(f"{count(lacking, 'run')} without an evaluation, or not ended: left out of the figures.")
-    tests = {
-        json.dumps({**(record.config.get("evaluation") or {}), "tracks": None})
-        for group in groups
-        for record in group.records
-    }
+    tests = set()
+    for record in (record for group in groups for record in group.records):
+        evaluation = record.config.get("evaluation") or {}
+        race = evaluation.get("race") or record.config.get("race")
+        tests.add(json.dumps({**evaluation, "tracks": None, "race": race}))
     if len(tests) > 1:
         lines.append("The runs were evaluated under different conditions: their figures do not compare.")
     return lines

@@ -99,6 +99,8 @@ class Database:
                 yield
             return
         with engine.connect() as connection:
+            # A wide search is composed meanwhile, and the server would end an idle transaction.
+            connection.execute(sa.text("SET LOCAL idle_in_transaction_session_timeout = 0"))
             connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_LOCK_NUMBER)))
             yield
 
