@@ -11,6 +11,7 @@ import pytest
 
 from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.aws.logs.recorded import METRICS_COLUMNS, STEP_COLUMNS, UPDATE_COLUMNS
+from deepracer_exp.reports.tables.log_view import prepare
 from tests.conftest import refused
 
 from . import made_up_logs as made
@@ -123,6 +124,18 @@ def test_metrics_report_the_episodes_of_the_trace(recording_of, layout):
         evaluated = recording.metrics[recording.metrics["stream"] != "training"].iloc[0]
         assert evaluated["stream"] in set(recording.steps["stream"])
         assert (evaluated["phase"], evaluated["episode"], evaluated["resets"]) == ("evaluation", 0, 1)
+
+
+def test_each_worker_has_the_track_of_its_own_configuration(tmp_path):
+    files = made.drfc_workers()
+    for number, world in ((1, "Oval_track"), (2, "Bowtie_track")):
+        files[f"training_params_{number}.yaml"] = f"WORLD_NAME: {world}\n"
+    recording = read_recording(made.write_folder(files, tmp_path))
+    driven = made.training(recording).groupby("worker")["track"].agg(lambda names: set(map(str, names)))
+    assert driven.tolist() == [{"Oval_track"}, {"Bowtie_track"}]
+    # The page of one track counts no episode of the other, not those of metrics files either.
+    view = prepare(recording, "Bowtie_track")
+    assert set(view.steps["worker"]) == set(view.recording.metrics["worker"]) == {1}
 
 
 def test_episodes_of_several_workers_are_numbered_by_iteration_and_worker(recording_of):

@@ -76,7 +76,7 @@ class JoinedSteps:
                 else np.full(len(table), trace.number, np.int64)
                 for trace, table in zip(traces, tables, strict=True)
             ]
-            world = self._parts.worlds.get(place.kind, "")
+            world = self._parts.world(place.kind, place.worker)
             yield Drives(place, concatenated(tables), np.concatenate(iterations), world, [place.name])
 
     def _add_log(self, number: int, files: Sequence[LogFile], log: TrainingLog) -> None:
@@ -113,7 +113,7 @@ class JoinedSteps:
                 other.world = log.world or other.world
                 other.names.append(place.name)
         if left.all():
-            mine.world = mine.world or self._parts.worlds.get(place.kind, "")
+            mine.world = mine.world or self._parts.world(place.kind, place.worker)
             self.drives.append(mine)
         elif left.any() and not alike:
             self.drives.append(mine.choose(left))

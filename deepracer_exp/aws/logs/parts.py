@@ -27,7 +27,7 @@ MOST_LISTED = 20
 _NUMBER = re.compile(r"(?<!\d)(\d{1,6})-iteration")
 _METADATA = re.compile(r"model_metadata.*\.json")
 _HYPERPARAMETERS = re.compile(r"hyper_?parameters.*?(?:\.json)?")
-_PARAMS = re.compile(r"(training|evaluation)_params.*\.ya?ml")
+_PARAMS = re.compile(r"(training|evaluation|eval)_params(?:_(\d{1,3}))?.*\.ya?ml")
 # Files that lie beside the logs of a model and hold no data of a recording.
 _BESIDE = re.compile(
     r".*\.(?:pb|ckpt.*|meta|index|data-.*|mp4|png|jpg|py|parquet|ya?ml|lock|ready|done|finished|pbtxt)|\..*|done|checkpoint"
@@ -64,8 +64,8 @@ class Parts:
     """Parameters about boxes and bots by kind of job (`job_settings.race_values`)."""
     model_checkpoints: list[tuple[LogFile, dict[str, str]]] = field(default_factory=list)
     """Names of the best and the last checkpoint in the folder of a model, by the keys of `checkpoint_names`."""
-    worlds: dict[str, str] = field(default_factory=dict)
-    """Course by kind of job, from the files that start it."""
+    worlds: dict[tuple[str, int], str] = field(default_factory=dict)
+    """Course by kind of job and worker, from the files that start it; a file for all workers counts as the first's."""
     files: list[LogFile] = field(default_factory=list)
     problems: list[LogProblem] = field(default_factory=list)
     steps: list[tuple[Any, LogFile, StepTables]] = field(default_factory=list)
@@ -88,6 +88,10 @@ class Parts:
         for _, _, steps in self.steps:
             while steps.rows and rows > sim_trace.MOST_STEPS:
                 rows -= steps.drop_first()
+
+    def world(self, kind: str, worker: int) -> str:
+        """Return the course of a worker's job, or that of the first where no file names one; "" where none does."""
+        return self.worlds.get((kind, worker)) or self.worlds.get((kind, 0), "")
 
     def refuse(self, file: LogFile, refused: list[tuple[int | None, str]]) -> None:
         """Add the unreadable parts of a file to the problems."""
@@ -161,10 +165,13 @@ def _read(parts: Parts, file: LogFile, alone: bool) -> bool:
     params = _PARAMS.fullmatch(name)
     if params is not None:
         job = read_yaml(file.path, "a job's parameters", raw=file.head(SETTINGS_BYTES + 1))
+        kind = "evaluation" if params[1] == "eval" else params[1]
+        # With a configuration for each worker, deepracer-for-cloud counts the files from 1.
+        worker = max(0, int(params[2] or 1) - 1)
         if world := _world(job):
-            parts.worlds[params[1]] = world
-        if isinstance(job, Mapping):
-            parts.races[params[1]] = race_values(job)
+            parts.worlds[kind, worker] = world
+        if isinstance(job, Mapping) and not worker:
+            parts.races[kind] = race_values(job)
         return True
     return _read_log(parts, file) if alone or LOG.search(name) else False
 

@@ -129,7 +129,7 @@ class _Assembly:
             metadata=uppermost(parts.metadata),
             hyperparameters=self.settings or None,
             reward_source=uppermost(parts.reward),
-            track=worlds[0] if worlds else parts.worlds.get(TRAINING),
+            track=worlds[0] if worlds else parts.world(TRAINING, 0) or None,
             problems=tuple(self.problems),
             files=tuple(file.path for file in parts.files),
             checkpoints=dict(sorted((counted | named).items())),
@@ -148,12 +148,16 @@ class _Assembly:
         rounds = np.concatenate([np.full(len(part.iteration), place[part.place.root]) for part in drives])
         worker = np.concatenate([np.full(len(part.iteration), part.place.worker) for part in drives])
         iteration = np.concatenate([part.iteration for part in drives])
+        # Each worker may drive on a track of its own; one that names none drives where its round does.
+        of_round = {part.place.root: part.world for part in reversed(drives) if part.world}
+        worlds = [part.world or of_round.get(part.place.root, "") for part in drives]
+        track = np.repeat(np.arange(len(drives)), [len(part.iteration) for part in drives])
         table = concatenated([part.table for part in drives])
         if len(drives) > 1:
             # The rows of several workers are put in the order of iterations.
             order = np.lexsort((worker, iteration, rounds))
             table = table.take(order)
-            rounds, worker, iteration = rounds[order], worker[order], iteration[order]
+            rounds, worker, iteration, track = rounds[order], worker[order], iteration[order], track[order]
         raw, steps = (table[name].to_numpy().astype(np.int64) for name in ("episode", "steps"))
         episode, numbers = number_episodes(rounds, worker, raw, iteration, steps)
         first: dict[int, int] = {}
@@ -166,11 +170,7 @@ class _Assembly:
             first[number] = so_far
             so_far = int(iteration[of].max()) + 1
         self.iteration_of = dict(zip(episode.tolist(), iteration.tolist(), strict=True))
-        worlds = [
-            next((part.world for part in drives if part.place.root == root and part.world), "")
-            for root in self.rounds
-        ]
-        return [Rows(TRAINING, table, worker, iteration, episode, worlds, rounds)], numbers, first
+        return [Rows(TRAINING, table, worker, iteration, episode, worlds, track)], numbers, first
 
     def _logs_of(self, number: int) -> list[TrainingLog]:
         """Return the logs of a round that name its checkpoints."""

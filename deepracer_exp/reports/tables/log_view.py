@@ -400,16 +400,16 @@ def prepare(log: Recording | RunRecording | EvaluationRecording, track: str | No
 
 
 def _on_course(recording: Recording, here: NDArray[np.bool_]) -> Recording:
-    """Return a recording without updates and metrics of iterations on other tracks only.
+    """Return a recording without updates and metrics of iterations, or workers, on other tracks only.
 
     `here` says of each row whether it is one of the training on the course. An iteration without a row belongs to the
     one before it.
     """
     training = (recording.steps["stream"] == TRAINING).to_numpy()
     number = recording.steps["iteration"].to_numpy()
-    driven = np.unique(number[training])
-    is_here = np.isin(driven, number[here])
-    if is_here.all():
+    driven, worker = np.unique(number[training]), recording.steps["worker"].to_numpy()
+    is_here, elsewhere = np.isin(driven, number[here]), np.setdiff1d(worker[training & ~here], worker[here])
+    if is_here.all() and not len(elsewhere):
         return recording
 
     def kept(rows: pd.DataFrame) -> NDArray[np.bool_]:
@@ -418,7 +418,8 @@ def _on_course(recording: Recording, here: NDArray[np.bool_]) -> Recording:
 
     updates, metrics = recording.updates, recording.metrics
     of_training = (metrics["stream"] == TRAINING).to_numpy()
-    return replace(recording, updates=updates[kept(updates)], metrics=metrics[~of_training | kept(metrics)])
+    kept_metrics = kept(metrics) & ~np.isin(metrics["worker"], elsewhere)
+    return replace(recording, updates=updates[kept(updates)], metrics=metrics[~of_training | kept_metrics])
 
 
 def _episodes(
