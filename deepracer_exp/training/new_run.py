@@ -60,7 +60,9 @@ def try_reward(experiment: Experiment, setup: RaceSetup) -> None:
     if experiment.device != "cpu" and (torch.device(experiment.device).index or 0) >= gpus:
         names = ["cpu", *(f"cuda:{number}" for number in range(gpus))]
         raise BadInput(
-            f"device={experiment.device}", f"PyTorch finds {count(gpus, 'GPU')} here", ", ".join(names)
+            f"device={experiment.device}",
+            f"PyTorch finds {count(gpus, 'GPU')} here",
+            f"{', '.join(names)}; a resumed run keeps its device, `deepracer-exp clone` may change it",
         )
 
 
