@@ -11,6 +11,7 @@ import dis
 import inspect
 import subprocess
 import sys
+from functools import cache
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
@@ -52,19 +53,22 @@ def _goes_outside(used: Any, seen: set[int]) -> bool:
     if isinstance(used, type) and used.__module__.startswith("tests."):
         return any(_goes_outside(method, seen) for method in vars(used).values())
     if isinstance(used, FunctionType) and used.__module__.startswith("tests."):
-        return bool(_imported(used.__code__) & _OUTSIDE) or any(
+        return bool(_imported(used.__code__)) or any(
             _goes_outside(used.__globals__.get(name), seen) for name in _names(used.__code__)
         )
     return False
 
 
+@cache
 def _names(code: CodeType) -> set[str]:
     return set(code.co_names).union(*map(_names, _within(code)))
 
 
+@cache
 def _imported(code: CodeType) -> set[str]:
-    """Return the modules that code imports."""
-    modules = {line.argval for line in dis.get_instructions(code) if line.opname == "IMPORT_NAME"}
+    """Return the modules of `_OUTSIDE` that code imports."""
+    lines = dis.get_instructions(code) if _OUTSIDE & {*code.co_names} else ()
+    modules = {line.argval for line in lines if line.opname == "IMPORT_NAME"} & _OUTSIDE
     return modules.union(*map(_imported, _within(code)))
 
 
