@@ -154,6 +154,22 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__ or error.__context__
 
 
+def run_if_there(client: Any, run_id: str) -> Any:
+    """Return a run of MLflow, None if the store does not know it.
+
+    Raises:
+        MlflowException: any other error; translated by `store_errors`.
+    """
+    from mlflow.exceptions import MlflowException
+
+    try:
+        return client.get_run(run_id)
+    except MlflowException as error:
+        if error.error_code != "RESOURCE_DOES_NOT_EXIST":
+            raise
+        return None
+
+
 def pages(search: Callable[..., Any], **what: Any) -> Iterator[Any]:
     """Return the results of one of the client's searches, from all pages.
 

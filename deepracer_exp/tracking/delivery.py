@@ -5,22 +5,18 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.runs.labels import USER_TAG, Labels, read_labels
 from deepracer_exp.runs.run_files import SUMMARY, TRACKING, read_object, read_run_id, run_folders
 from deepracer_exp.runs.run_result import FAILED, FINISHED, STOPPED_EARLY
 
-from .calls import StoreRefusedError, StoreUnavailableError
+from .calls import StoreRefusedError, StoreUnavailableError, run_if_there
 from .metadata import NAME, USER_NOTE, label_tags
 from .mlflow_metrics import now_ms, points_at
 from .projection import MLflowProjection
 from .store import has_store, open_client, prepare_mlflow, resolve_store
 from .tracking_file import Status, read_recorded, read_tracked_run, write_tracked_run
-
-if TYPE_CHECKING:
-    from mlflow import MlflowClient
 
 ENDS: dict[str, Status] = {FINISHED: "FINISHED", STOPPED_EARLY: "FINISHED", FAILED: "FAILED"}
 """MLflow's word for the `status` in a run's summary; any other is KILLED."""
@@ -60,9 +56,8 @@ def deliver(run_dir: Path, uri: str | None, runs_dir: Path) -> int:
     if problem is not None:
         raise BadInput(run_dir, f"MLflow ({store.shown}) {problem}")
     if (run_id := read_run_id(run_dir)) is not None:
-        deliver_labels(
-            run_id, read_labels(run_dir), uri, runs_dir
-        )  # without those that were removed meanwhile
+        # Without those that were removed while the store was away.
+        deliver_labels(run_id, read_labels(run_dir), uri, runs_dir)
     return projection.written
 
 
@@ -153,18 +148,6 @@ def recorded_labels(run_id: str, uri: str | None, runs_dir: Path) -> Labels:
     return Labels(tags.get(NAME), tags.get(USER_NOTE), labels)
 
 
-def _is_active(client: "MlflowClient", run_id: str) -> bool:
-    """Return whether a store has a run that is not deleted."""
-    from mlflow.exceptions import MlflowException
-
-    try:
-        return bool(client.get_run(run_id).info.lifecycle_stage == "active")
-    except MlflowException as error:
-        if error.error_code != "RESOURCE_DOES_NOT_EXIST":
-            raise
-        return False  # removed by `mlflow gc`, or the store is a new one
-
-
 @contextmanager
 def marked_deleted(run_dir: Path, run_id: str, uri: str | None, runs_dir: Path) -> Iterator[None]:
     """Mark a run as deleted in the store that recorded it, once the block has removed its folder.
@@ -184,7 +167,8 @@ def marked_deleted(run_dir: Path, run_id: str, uri: str | None, runs_dir: Path) 
         yield
         return
     with open_client(f"{run_dir}: nothing was deleted", uri, runs_dir) as client:
-        is_active = _is_active(client, run_id)
+        run = run_if_there(client, run_id)  # gone after `mlflow gc`, or in a store that was made anew
+        is_active = run is not None and run.info.lifecycle_stage == "active"
     # A copy of the folder has the same record, which is not its own to delete.
     others = (folder for folder in run_folders(runs_dir) if folder.resolve() != run_dir.resolve())
     is_active = is_active and not any(read_run_id(folder) == run_id for folder in others)

@@ -17,7 +17,7 @@ from mlflow.entities import Metric, Param, RunTag, ViewType
 from mlflow.exceptions import MlflowException
 from mlflow.utils.validation import MAX_METRICS_PER_BATCH, MAX_PARAMS_TAGS_PER_BATCH, MAX_TAG_VAL_LENGTH
 
-from .calls import CALL_S, StoreRefusedError, Value, ended_within, pages, store_errors
+from .calls import CALL_S, StoreRefusedError, Value, ended_within, pages, run_if_there, store_errors
 from .metadata import (
     END_TAG,
     EXPERIMENT_TAGS,
@@ -70,7 +70,7 @@ class MLflowRun:
         `run_id`: the id of an earlier answer; a store that does not know it is a new one.
         """
         with store_errors():
-            if run_id is not None and not self._has(run_id):
+            if run_id is not None and run_if_there(self._client, run_id) is None:
                 run_id = None
             if run_id is None:
                 experiment_id = self._experiment_id(tracked.experiment)
@@ -83,15 +83,6 @@ class MLflowRun:
             if END_TAG in self._tags and END_TAG not in tracked.tags:
                 self._client.delete_tag(run_id, END_TAG)
                 del self._tags[END_TAG]
-
-    def _has(self, run_id: str) -> bool:
-        try:
-            self._client.get_run(run_id)
-        except MlflowException as error:
-            if error.error_code != "RESOURCE_DOES_NOT_EXIST":
-                raise
-            return False
-        return True
 
     def read(self, run_id: str) -> None:
         """Open a run of the store without changing its state."""
@@ -252,11 +243,10 @@ class MLflowRun:
 
     def _find(self, experiment_id: str, tracked: TrackedRun) -> str | None:
         began = f"attributes.start_time = {tracked.start_ms}"
-        run_dir = tracked.tags.get("run_dir")
+        # By its name, which people change, only where it has no folder.
+        wanted = tracked.tags.get("run_dir") or tracked.run_name
         for run in self._client.search_runs([experiment_id], began, ViewType.ALL):
-            # By its name, which people change, only where there is nothing else.
-            is_same = run.info.run_name == tracked.run_name if run_dir is None else True
-            if is_same and run.data.tags.get("run_dir") == run_dir:
+            if (run.data.tags.get("run_dir") or run.info.run_name) == wanted:
                 return run.info.run_id
         return None
 
