@@ -11,6 +11,7 @@ import pytest
 
 from deepracer_exp.aws.logs.reader import read_recording
 from deepracer_exp.aws.logs.recorded import METRICS_COLUMNS, STEP_COLUMNS, UPDATE_COLUMNS
+from deepracer_exp.aws.worlds.routes import world_rows
 from deepracer_exp.reports.tables.log_view import prepare
 from tests.conftest import refused
 
@@ -118,7 +119,8 @@ def test_metrics_report_the_episodes_of_the_trace(recording_of, layout):
     driven = made.training(recording).groupby("episode")
     assert sorted(logged.index) == sorted(driven.groups)
     assert (logged["reward"] == driven["reward"].sum().astype(int)[logged.index]).all()
-    assert (logged["worker"] == driven["worker"].first()[logged.index]).all()
+    for name in ("worker", "iteration"):
+        assert (logged[name] == driven[name].first()[logged.index]).all()
     assert set(logged["episode_status"]) == {"lap_complete"}
     if layout != "drfc_workers":
         evaluated = recording.metrics[recording.metrics["stream"] != "training"].iloc[0]
@@ -136,6 +138,21 @@ def test_each_worker_has_the_track_of_its_own_configuration(tmp_path):
     # The page of one track counts no episode of the other, not those of metrics files either.
     view = prepare(recording, "Bowtie_track")
     assert set(view.steps["worker"]) == set(view.recording.metrics["worker"]) == {1}
+
+
+def test_the_parameters_of_the_last_evaluation_name_no_other_world_of_an_earlier_one(tmp_path):
+    files = made.drfc_single()
+    for day, world in ((2, "Bowtie_track"), (3, "Oval_track")):
+        waypoints = world_rows(world)[:6, :2]
+        lap = made.drives([0], seed=50 + day).assign(
+            X=waypoints[:, 0], Y=waypoints[:, 1], closest_waypoint=np.arange(6), track_len=10.0 + day
+        )
+        files[f"evaluation-2024010{day}101010/evaluation-simtrace/0-iteration.csv"] = made.csv_text(lap)
+    files["evaluation_params.yaml"] = "WORLD_NAME: Oval_track\n"
+    steps = read_recording(made.write_folder(files, tmp_path)).steps
+    named = steps[steps["stream"] != "training"].groupby("stream", observed=True)["track"].first()
+    # The course of the first one, with points at random, is none of the service's.
+    assert named.astype(str).tolist() == ["", "Bowtie_track", "Oval_track"]
 
 
 def test_episodes_of_several_workers_are_numbered_by_iteration_and_worker(recording_of):

@@ -6,6 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from deepracer_exp.aws.archives import natural
+from deepracer_exp.aws.worlds.routes import recognise
+
 from .drives import (
     EPISODES_PER_ITERATION,
     Drives,
@@ -20,6 +23,11 @@ from .log_files import LogFile, Place, place_of, without_worker
 from .parts import Parts, TraceFile
 from .recorded import TRAINING, LogProblem
 from .text_log import TrainingLog, join_rolled
+
+_SAME_LENGTH_M = 0.01
+"""Lengths of one world that were logged with more and with fewer digits differ by less."""
+_SAMPLE = 500
+"""Rows that are enough to recognise a world."""
 
 
 class JoinedSteps:
@@ -41,6 +49,7 @@ class JoinedSteps:
         self.settings = uppermost(parts.hyperparameters) or {}
         self.logs = join_rolled(parts.logs)
         self.drives = list(self._drives_of_csv())
+        self._recognise_other_worlds()
         self.roots: dict[int, tuple[str, ...]] = {}
         self._jobs: dict[tuple[str, ...], tuple[str, ...]] = {}
         """Folder of the CSVs by the root of the text logs of the same training."""
@@ -78,6 +87,17 @@ class JoinedSteps:
             ]
             world = self._parts.world(place.kind, place.worker)
             yield Drives(place, concatenated(tables), np.concatenate(iterations), world, [place.name])
+
+    def _recognise_other_worlds(self) -> None:
+        """Name the worlds of races on another than the last one's, which alone is in the file of parameters."""
+        for kind in {drives.place.kind for drives in self.drives} - {TRAINING}:
+            races = [drives for drives in self.drives if drives.place.kind == kind]
+            last = max(races, key=lambda drives: natural(drives.place.name))
+            last_m = last.table["track_len"].to_numpy()[:1]
+            for drives in races:
+                length_m = drives.table["track_len"].to_numpy()[:1]
+                if drives.world and not np.allclose(length_m, last_m, atol=_SAME_LENGTH_M):
+                    drives.world = _world_of(drives)
 
     def _add_log(self, number: int, files: Sequence[LogFile], log: TrainingLog) -> None:
         """Add the drives of a log, unless they are known already from CSVs or another log."""
@@ -163,6 +183,17 @@ class JoinedSteps:
                 reason = f"{count} rows are left out: they are there twice"
                 self.problems.append(LogProblem("/".join(drives.place.root), None, reason, lines=count))
                 self.drives[number] = drives.choose(~twice)
+
+
+def _world_of(drives: Drives) -> str:
+    """Return the world whose waypoints are numbered as in the rows, "" if there is none."""
+    rows = drives.table.select(["X", "Y", "closest_waypoint"]).to_pandas()
+    rows = rows[np.isfinite(rows).all(axis=1) & (rows["closest_waypoint"] >= 0)]
+    rows = rows.iloc[:: max(1, len(rows) // _SAMPLE)]
+    if rows.empty:
+        return ""
+    matches = recognise(rows[["X", "Y"]].to_numpy(), rows["closest_waypoint"].to_numpy(np.intp))
+    return matches[0].name if matches else ""
 
 
 def log_place(files: Sequence[LogFile], log: TrainingLog) -> Place:

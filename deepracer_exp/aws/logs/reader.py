@@ -279,16 +279,18 @@ class _Assembly:
                 if gone:
                     self._leave_out(file, "episodes", gone)
                 counted = _iterations_by_trial(episodes)
-                shifts = [
+                keys = [(number, worker, row["episode"]) for row in episodes]
+                # Trials tell iterations apart; which ones they are, the traced episode before each says.
+                traced = [
                     self.iteration_of[numbers[key]] - index
-                    for row, index in zip(episodes, counted, strict=True)
-                    if row["phase"] == TRAINING and (key := (number, worker, row["episode"])) in numbers
+                    if row["phase"] == TRAINING and key in numbers
+                    else np.nan
+                    for row, index, key in zip(episodes, counted, keys, strict=True)
                 ]
-                shift = int(np.median(shifts)) if shifts else first.get(number, 0)
-                for row, index in zip(episodes, counted, strict=True):
+                shifts = pd.Series(traced).ffill().bfill().fillna(first.get(number, 0)).astype(int)
+                for row, index, key, shift in zip(episodes, counted, keys, shifts, strict=True):
                     if row["episode"] < begin:
                         continue
-                    key = (number, worker, row["episode"])
                     episode = numbers.get(key)
                     if episode is None:
                         episode = _behind(numbers, key)
