@@ -373,7 +373,6 @@ class Race:
             self._servos.steering = checked_array(state, "servos", self._servos.steering.shape)
         self._draw_again(self._everyone)
         self._batch.set_floor_friction(self._everyone, self._floors[self.rules.course])
-        # Last: setting a car's mass overwrites parts of the physics state.
         self._batch.state = physics
 
     def state_arrays(self) -> dict[str, np.ndarray]:

@@ -169,10 +169,7 @@ class CarBatch:
 
     def set_mass_scale(self, ids: Ids, scale: Floats) -> None:
         """Multiply cars' masses and inertias by scale, (n,), relative to the configured ones."""
-        self._batch.expand("body_mass")[ids] = scale[:, None] * self.model.body_mass
-        self._batch.expand("body_inertia")[ids] = scale[:, None, None] * self.model.body_inertia
-        self._batch.set_const(np.sort(ids))
-        for field in ("mass_kg", "yaw_inertia_kgm2", "wheel_kg"):
+        for field in ("mass_scale", "mass_kg", "yaw_inertia_kgm2", "wheel_kg"):
             self._cars[field][ids] = scale * self._car[field]
 
     def set_motor_scale(self, ids: Ids, scale: Floats) -> None:

@@ -22,6 +22,7 @@ GRAVITY_MPS2 = 9.8
 CAR = np.dtype(
     [
         ("mass_kg", "f8"),
+        ("mass_scale", "f8"),
         ("yaw_inertia_kgm2", "f8"),
         ("com_x_m", "f8"),
         ("com_z_m", "f8"),
@@ -68,6 +69,7 @@ def car_record(car: CarConfig) -> Cars:
     """Return a car as one `CAR` record, shape ()."""
     radius = car.wheel_radius_m
     record = np.zeros((), CAR)
+    record["mass_scale"] = 1.0
     record["mass_kg"], record["yaw_inertia_kgm2"] = car.mass_kg, car.inertia_kgm2[2]
     record["com_x_m"], record["com_z_m"] = car.com_x_m, car.com_z_m
     record["axle_x_m"] = car.front_axle_x_m, car.rear_axle_x_m
@@ -243,7 +245,8 @@ def push_cars(cars, drives, motion, commands, clock, forces):  # type: ignore[no
             rad/s.
         commands: commanded speed_mps and steering_rad, (N, 2).
         clock: a `Clock`.
-        forces: written: force in the world, N, N, and torque, N m, (N, 3).
+        forces: written: force in the world, N, N, and torque, N m, (N, 3), on cars without `mass_scale`: MuJoCo moves
+            all cars as if they had the configured mass.
     """
     yaw_rad, velocity = motion
     for n in range(len(cars)):
@@ -254,6 +257,6 @@ def push_cars(cars, drives, motion, commands, clock, forces):  # type: ignore[no
         ahead_n, left_n, torque_nm = tyre_forces(
             car, drive, cos * vx + sin * vy, cos * vy - sin * vx, velocity[n, 2], clock.dt_s
         )
-        forces[n, 0] = cos * ahead_n - sin * left_n
-        forces[n, 1] = sin * ahead_n + cos * left_n
-        forces[n, 2] = torque_nm
+        forces[n, 0] = (cos * ahead_n - sin * left_n) / car.mass_scale
+        forces[n, 1] = (sin * ahead_n + cos * left_n) / car.mass_scale
+        forces[n, 2] = torque_nm / car.mass_scale

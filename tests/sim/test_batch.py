@@ -182,6 +182,20 @@ def test_a_scale_of_one_changes_nothing(setter):
     np.testing.assert_array_equal(plain.state, scaled.state)
 
 
+def test_a_car_made_heavier_drives_as_one_that_is_configured_so():
+    made = CarBatch(CAR, 1, 1)
+    made.set_mass_scale(np.array([0]), np.array([1.5]))
+    heavy = {name: 1.5 * getattr(CAR, name) for name in ("mass_kg", "wheel_spin_inertia_kgm2")}
+    inertia = tuple(1.5 * moment for moment in CAR.inertia_kgm2)
+    configured = CarBatch(dataclasses.replace(CAR, **heavy, inertia_kgm2=inertia), 1, 1)
+    for speed_mps, steering_deg in ((3.0, 0.0), (3.0, 25.0), (0.5, -25.0)):
+        np.testing.assert_allclose(
+            drive(made, speed_mps, steering_deg, 10),
+            drive(configured, speed_mps, steering_deg, 10),
+            atol=1e-9,
+        )
+
+
 def test_a_heavy_car_and_a_weak_motor_gain_speed_slowly():
     cars = CarBatch(CAR, 3, 1)
     cars.set_mass_scale(np.array([1]), np.array([2.0]))

@@ -1,5 +1,6 @@
 """Domain randomization: what each car draws for each of its episodes, from its own random streams."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from enum import IntEnum
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from deepracer_exp.config.driving import OFF, QUANTITIES, RandomizationConfig, car_differs
 from deepracer_exp.env.state import checked_array
+from deepracer_exp.jit import compiled
 from deepracer_exp.sim.batch import CarBatch
 
 Floats = NDArray[np.float64]
@@ -183,9 +185,9 @@ class Randomization:
         acts = self._on & {"steering_noise_deg", "speed_noise"}
         sees = self._on & {"observation_noise", "observation_dropout"}
         self._episodes = CarStreams(seed, self._cars, Purpose.EPISODE)
-        self._action = self._step_noise(seed, Purpose.ACTION, 2) if acts else None
-        width = 1 + len(self._measured)
-        self._observation = self._step_noise(seed, Purpose.OBSERVATION, width) if sees else None
+        drawing, width = np.flatnonzero(self._differs), 1 + len(self._measured)
+        self._action = self._step_noise(seed, Purpose.ACTION, 2, drawing[: None if acts else 0])
+        self._observation = self._step_noise(seed, Purpose.OBSERVATION, width, drawing) if sees else None
 
     def state_dict(self) -> dict[str, Any]:
         """Return the values of the episodes, delayed commands, and the position of the noise."""
@@ -195,7 +197,7 @@ class Randomization:
             "sent": self._commands.copy(),
             "deaf_until": self._no_command_until.copy(),
             "first_noise": self._first_noise.copy(),
-            "action_steps": 0 if self._action is None else self._action.steps,
+            "action_steps": self._action.steps,
             "observation_steps": 0 if self._observation is None else self._observation.steps,
         }
 
@@ -208,9 +210,9 @@ class Randomization:
         for name, apply in self._varying_physics.items():
             apply(self._rows, self._of(name))
         self.seed(state["seed"])
-        for noise, steps in ((self._action, "action_steps"), (self._observation, "observation_steps")):
-            if noise is not None:
-                noise.steps = state[steps]
+        self._action.steps = state["action_steps"]
+        if self._observation is not None:
+            self._observation.steps = state["observation_steps"]
 
     def begin(self, ids: Ids, episodes: NDArray[np.int64]) -> None:
         """Draw the values of new episodes of the cars `ids`; episodes are numbered per car from 0."""
@@ -242,27 +244,10 @@ class Randomization:
         Returns:
             Steering, speed, and False for cars that no command has reached yet, each (N,).
         """
-        moving = steps > 1
-        slots = len(self._commands)
-        if slots > 1:
-            sent = steps - self._of("action_delay_steps").astype(np.int64)
-            steering_at, speed_at = sent - self._late_steps
-            self._commands[steps % slots, self._rows] = np.stack([steering_deg, speed_mps], axis=1)
-            steering_deg = self._commands[steering_at % slots, self._rows, 0]
-            # Commands of the last episode are void, and the speed may arrive before the steering.
-            steering_deg = np.where(steering_at > self._no_command_until, steering_deg, 0.0)
-            speed_mps = self._commands[speed_at % slots, self._rows, 1]
-            moving = speed_at > self._no_command_until
-        if "battery_sag" in self._on:
-            driven = np.clip((steps - 2) / self._sag_steps, 0.0, 1.0)
-            speed_mps = speed_mps * (1 - self._of("battery_sag") * driven)
-        if self._action is not None:
-            noise = self._action.normal()
-            steering_deg = steering_deg + self._of("steering_noise_deg") * noise[:, 0]
-            speed_mps = speed_mps * (1 + self._of("speed_noise") * noise[:, 1])
-        if "steering_offset_deg" in self._on:
-            steering_deg = steering_deg + self._of("steering_offset_deg")
-        return steering_deg, speed_mps, moving
+        noise, late = self._action.normal(), (self._late_steps, self._no_command_until)
+        return _disturb_commands(
+            steering_deg, speed_mps, steps, self.values, noise, late, self._commands, self._sag_steps
+        )
 
     def forget_commands(self, ids: Ids, steps: NDArray[np.int64]) -> None:
         """Drop delayed commands of the cars `ids` up to these steps, (n,); they stand still until a new one arrives."""
@@ -277,13 +262,10 @@ class Randomization:
         """
         if self._observation is None:
             return features
-        from scipy.special import ndtr  # takes a quarter of a second, and few trainings have noise
-
-        normal = self._observation.normal()
-        if "observation_noise" in self._on:
-            features = features + self._noise(self._rows, normal[:, 1:])
-        self.dropped = ndtr(normal[:, 0]) < self._of("observation_dropout")
-        return np.where(self.dropped[:, None], before, features)
+        observed, self.dropped = _disturb_observation(
+            features, before, self.values, self._measured, self._observation.normal()
+        )
+        return observed
 
     def disturb_first_observation(self, ids: Ids, features: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the first observations of the episodes of the cars `ids`, given their features, (n, F)."""
@@ -295,9 +277,54 @@ class Randomization:
         deviation = self.values[ids, _COLUMN["observation_noise"], None] * self._measured
         return np.asarray(deviation * normal, np.float32)
 
-    def _step_noise(self, seed: int, purpose: Purpose, width: int) -> StepNoise:
-        streams, cars = CarStreams(seed, self._cars, purpose), np.flatnonzero(self._differs)
-        return StepNoise(streams, len(self._cars), width, cars)
+    def _step_noise(self, seed: int, purpose: Purpose, width: int, drawing: Ids) -> StepNoise:
+        return StepNoise(CarStreams(seed, self._cars, purpose), len(self._cars), width, drawing)
 
     def _of(self, name: str) -> Floats:
         return self.values[:, _COLUMN[name]]
+
+
+_DELAY, _SAG, _OFFSET, _STEERING_NOISE, _SPEED_NOISE, _NOISE, _DROPOUT = (
+    _COLUMN[name]
+    for name in (
+        *("action_delay_steps", "battery_sag", "steering_offset_deg", "steering_noise_deg", "speed_noise"),
+        *("observation_noise", "observation_dropout"),
+    )
+)
+
+
+@compiled
+def _disturb_commands(steering_deg, speed_mps, steps, values, noise, late, commands, sag_steps):  # type: ignore[no-untyped-def]
+    """Compute what `Randomization.disturb_commands` returns; `commands`, the last ones, are changed in place.
+
+    `late` are the steps by which steering and speed come later, (2, N), and those up to which commands are void, (N,).
+    """
+    cars, slots = len(steering_deg), len(commands)
+    late_steps, void_until = late
+    sent_deg, sent_mps, moving = np.empty(cars), np.empty(cars), np.empty(cars, np.bool_)
+    for car in range(cars):
+        step, drawn = steps[car], values[car]
+        commands[step % slots, car, 0], commands[step % slots, car, 1] = steering_deg[car], speed_mps[car]
+        steering_at = step - int(drawn[_DELAY]) - late_steps[0, car]
+        speed_at = step - int(drawn[_DELAY]) - late_steps[1, car]
+        # Commands of the last episode are void, and the speed may arrive before the steering.
+        moving[car] = speed_at > void_until[car]
+        deg = commands[steering_at % slots, car, 0] if steering_at > void_until[car] else 0.0
+        mps = commands[speed_at % slots, car, 1]
+        mps *= 1.0 - drawn[_SAG] * min(max((step - 2) / sag_steps, 0.0), 1.0)
+        sent_deg[car] = deg + drawn[_STEERING_NOISE] * noise[car, 0] + drawn[_OFFSET]
+        sent_mps[car] = mps * (1.0 + drawn[_SPEED_NOISE] * noise[car, 1])
+    return sent_deg, sent_mps, moving
+
+
+@compiled
+def _disturb_observation(features, before, values, measured, normal):  # type: ignore[no-untyped-def]
+    """Return the observations, (N, F) float32, and whether each car's is the one before, given 1 + F numbers a car."""
+    observed, dropped = np.empty_like(features), np.empty(len(features), np.bool_)
+    for car in range(len(features)):
+        # The distribution function of the standard normal one: a number between 0 and 1.
+        dropped[car] = 0.5 * math.erfc(-normal[car, 0] / math.sqrt(2.0)) < values[car, _DROPOUT]
+        for n in range(features.shape[1]):
+            noise = values[car, _NOISE] * measured[n] * normal[car, 1 + n]
+            observed[car, n] = before[car, n] if dropped[car] else features[car, n] + np.float32(noise)
+    return observed, dropped
