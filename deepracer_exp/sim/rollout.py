@@ -69,7 +69,7 @@ def advance(cars, drives, state, command, period, after):  # type: ignore[no-unt
     velocity, forces, commands = np.empty((1, 3)), np.empty((1, 3)), np.empty((1, 2))
     velocity[0] = state[3:6]
     commands[0] = command
-    mass_kg, inertia_kgm2 = cars[0].mass_kg, cars[0].yaw_inertia_kgm2
+    mass_kg, inertia_kgm2 = cars[0].mass_kg, cars[0].yaw_inertia_kgm2  # of the configured mass, see `one_car`
     for step in range(steps):
         push_cars(cars, drives, (after[2:3], velocity), commands, Clock(step, steps, dt_s), forces)
         velocity[0, 0] += dt_s * forces[0, 0] / mass_kg

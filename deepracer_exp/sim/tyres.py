@@ -48,7 +48,7 @@ CAR = np.dtype(
     ],
     align=True,
 )
-"""Constants of a car that `tyre_forces` reads."""
+"""Constants of a car that `send`, `tyre_forces` and `push_cars` read; `mass_scale` is in its masses already."""
 
 DRIVE = np.dtype(
     [
@@ -245,8 +245,8 @@ def push_cars(cars, drives, motion, commands, clock, forces):  # type: ignore[no
             rad/s.
         commands: commanded speed_mps and steering_rad, (N, 2).
         clock: a `Clock`.
-        forces: written: force in the world, N, N, and torque, N m, (N, 3), on cars without `mass_scale`: MuJoCo moves
-            all cars as if they had the configured mass.
+        forces: written: force in the world, N, N, and torque, N m, over the car's `mass_scale`, (N, 3): MuJoCo moves
+            all cars with the configured mass.
     """
     yaw_rad, velocity = motion
     for n in range(len(cars)):

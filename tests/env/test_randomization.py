@@ -245,7 +245,9 @@ def test_each_car_has_the_grip_the_mass_the_motors_and_the_servos_it_drew():
     friction, mass, motor, servo = (drawn_of(race, name) for name in scales)
     floor = race.setup.track.floor.friction
     np.testing.assert_allclose(cars["friction"], friction * floor * nominal["friction"])
-    np.testing.assert_allclose(cars["mass_kg"], mass * nominal["mass_kg"])
+    np.testing.assert_allclose(cars["mass_scale"], mass)
+    for name in ("mass_kg", "yaw_inertia_kgm2", "wheel_kg"):
+        np.testing.assert_allclose(cars[name], mass * nominal[name])
     np.testing.assert_allclose(cars["motor_n"], motor * nominal["motor_n"])
     np.testing.assert_allclose(cars["steering_time_s"], nominal["steering_time_s"] / servo)
 

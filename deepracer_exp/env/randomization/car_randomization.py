@@ -21,6 +21,14 @@ _SAG_S = 20.0
 """Seconds of driving over which the battery sags: about a lap, so that an episode covers the whole range."""
 
 _COLUMN = {name: column for column, name in enumerate(QUANTITIES)}
+_OF_COMMANDS = tuple(
+    _COLUMN[name]
+    for name in (
+        *("action_delay_steps", "battery_sag", "steering_offset_deg"),
+        *("steering_noise_deg", "speed_noise"),
+    )
+)
+_OF_OBSERVATION = _COLUMN["observation_noise"], _COLUMN["observation_dropout"]
 _KNOWN = ("last_steering", "last_speed")
 """Features that are commands, not measurements, and therefore exact."""
 
@@ -186,7 +194,7 @@ class Randomization:
         sees = self._on & {"observation_noise", "observation_dropout"}
         self._episodes = CarStreams(seed, self._cars, Purpose.EPISODE)
         drawing, width = np.flatnonzero(self._differs), 1 + len(self._measured)
-        self._action = self._step_noise(seed, Purpose.ACTION, 2, drawing[: None if acts else 0])
+        self._action = self._step_noise(seed, Purpose.ACTION, 2, drawing if acts else drawing[:0])
         self._observation = self._step_noise(seed, Purpose.OBSERVATION, width, drawing) if sees else None
 
     def state_dict(self) -> dict[str, Any]:
@@ -245,13 +253,12 @@ class Randomization:
             Steering, speed, and False for cars that no command has reached yet, each (N,).
         """
         noise, late = self._action.normal(), (self._late_steps, self._no_command_until)
-        return _disturb_commands(
-            steering_deg, speed_mps, steps, self.values, noise, late, self._commands, self._sag_steps
-        )
+        sent, drawn = (steering_deg, speed_mps), (self.values, _OF_COMMANDS)
+        return _disturb_commands(sent, steps, drawn, noise, late, self._commands, self._sag_steps)
 
     def forget_commands(self, ids: Ids, steps: NDArray[np.int64]) -> None:
         """Drop delayed commands of the cars `ids` up to these steps, (n,); they stand still until a new one arrives."""
-        self._no_command_until[ids] = steps
+        self._no_command_until[ids] = np.maximum(steps, 1)  # the first is the prepare step
 
     def disturb_observation(
         self, features: NDArray[np.float32], before: NDArray[np.float32]
@@ -263,7 +270,7 @@ class Randomization:
         if self._observation is None:
             return features
         observed, self.dropped = _disturb_observation(
-            features, before, self.values, self._measured, self._observation.normal()
+            features, before, (self.values, _OF_OBSERVATION), self._measured, self._observation.normal()
         )
         return observed
 
@@ -284,47 +291,51 @@ class Randomization:
         return self.values[:, _COLUMN[name]]
 
 
-_DELAY, _SAG, _OFFSET, _STEERING_NOISE, _SPEED_NOISE, _NOISE, _DROPOUT = (
-    _COLUMN[name]
-    for name in (
-        *("action_delay_steps", "battery_sag", "steering_offset_deg", "steering_noise_deg", "speed_noise"),
-        *("observation_noise", "observation_dropout"),
-    )
-)
-
-
 @compiled
-def _disturb_commands(steering_deg, speed_mps, steps, values, noise, late, commands, sag_steps):  # type: ignore[no-untyped-def]
-    """Compute what `Randomization.disturb_commands` returns; `commands`, the last ones, are changed in place.
+def _disturb_commands(sent, steps, drawn, noise, late, commands, sag_steps):  # type: ignore[no-untyped-def]
+    """Compute what `Randomization.disturb_commands` returns.
 
-    `late` are the steps by which steering and speed come later, (2, N), and those up to which commands are void, (N,).
+    Args:
+        sent: steering and speed as sent, (N,) each.
+        steps: control steps of the episodes, (N,).
+        drawn: values of the episodes, (N, Q), and the columns `_OF_COMMANDS`.
+        noise: standard normal numbers, (N, 2).
+        late: steps by which steering and speed come later, (2, N), and those up to which commands are void, (N,).
+        commands: changed: those of the last steps, (slots, N, 2).
+        sag_steps: control steps over which the battery sags.
     """
-    cars, slots = len(steering_deg), len(commands)
-    late_steps, void_until = late
+    (steering_deg, speed_mps), (late_steps, void_until), slots = sent, late, len(commands)
+    values, (delay, sag, offset, steering_noise, speed_noise) = drawn
+    cars = len(steps)
     sent_deg, sent_mps, moving = np.empty(cars), np.empty(cars), np.empty(cars, np.bool_)
     for car in range(cars):
-        step, drawn = steps[car], values[car]
+        step, of_car = steps[car], values[car]
         commands[step % slots, car, 0], commands[step % slots, car, 1] = steering_deg[car], speed_mps[car]
-        steering_at = step - int(drawn[_DELAY]) - late_steps[0, car]
-        speed_at = step - int(drawn[_DELAY]) - late_steps[1, car]
+        steering_at = step - int(of_car[delay]) - late_steps[0, car]
+        speed_at = step - int(of_car[delay]) - late_steps[1, car]
         # Commands of the last episode are void, and the speed may arrive before the steering.
         moving[car] = speed_at > void_until[car]
         deg = commands[steering_at % slots, car, 0] if steering_at > void_until[car] else 0.0
         mps = commands[speed_at % slots, car, 1]
-        mps *= 1.0 - drawn[_SAG] * min(max((step - 2) / sag_steps, 0.0), 1.0)
-        sent_deg[car] = deg + drawn[_STEERING_NOISE] * noise[car, 0] + drawn[_OFFSET]
-        sent_mps[car] = mps * (1.0 + drawn[_SPEED_NOISE] * noise[car, 1])
+        mps *= 1.0 - of_car[sag] * min(max((step - 2) / sag_steps, 0.0), 1.0)
+        sent_deg[car] = deg + of_car[steering_noise] * noise[car, 0] + of_car[offset]
+        sent_mps[car] = mps * (1.0 + of_car[speed_noise] * noise[car, 1])
     return sent_deg, sent_mps, moving
 
 
 @compiled
-def _disturb_observation(features, before, values, measured, normal):  # type: ignore[no-untyped-def]
-    """Return the observations, (N, F) float32, and whether each car's is the one before, given 1 + F numbers a car."""
+def _disturb_observation(features, before, drawn, measured, normal):  # type: ignore[no-untyped-def]
+    """Return the observations, (N, F) float32, and whether each car's is the one before, given 1 + F numbers a car.
+
+    `drawn` are the values of the episodes, (N, Q), and the columns `_OF_OBSERVATION`; `measured` is 0 for features
+    without noise, else 1, (F,).
+    """
+    values, (noise, dropout) = drawn
     observed, dropped = np.empty_like(features), np.empty(len(features), np.bool_)
     for car in range(len(features)):
-        # The distribution function of the standard normal one: a number between 0 and 1.
-        dropped[car] = 0.5 * math.erfc(-normal[car, 0] / math.sqrt(2.0)) < values[car, _DROPOUT]
+        # The normal distribution's function makes it a number between 0 and 1, all equally likely.
+        dropped[car] = 0.5 * math.erfc(-normal[car, 0] / math.sqrt(2.0)) < values[car, dropout]
         for n in range(features.shape[1]):
-            noise = values[car, _NOISE] * measured[n] * normal[car, 1 + n]
-            observed[car, n] = before[car, n] if dropped[car] else features[car, n] + np.float32(noise)
+            added = values[car, noise] * measured[n] * normal[car, 1 + n]
+            observed[car, n] = before[car, n] if dropped[car] else features[car, n] + np.float32(added)
     return observed, dropped
