@@ -49,7 +49,6 @@ class JoinedSteps:
         self.settings = uppermost(parts.hyperparameters) or {}
         self.logs = join_rolled(parts.logs)
         self.drives = list(self._drives_of_csv())
-        self._recognise_other_worlds()
         self.roots: dict[int, tuple[str, ...]] = {}
         self._jobs: dict[tuple[str, ...], tuple[str, ...]] = {}
         """Folder of the CSVs by the root of the text logs of the same training."""
@@ -59,6 +58,7 @@ class JoinedSteps:
             range(len(self.logs)), key=lambda index: log_place(*self.logs[index]).kind != TRAINING
         ):
             self._add_log(number, *self.logs[number])
+        self._name_worlds()
         for drives in self.drives:
             drives.place = replace(drives.place, root=self._jobs.get(drives.place.root, drives.place.root))
         self.roots = {number: self._jobs.get(root, root) for number, root in self.roots.items()}
@@ -85,19 +85,22 @@ class JoinedSteps:
                 else np.full(len(table), trace.number, np.int64)
                 for trace, table in zip(traces, tables, strict=True)
             ]
-            world = self._parts.world(place.kind, place.worker)
-            yield Drives(place, concatenated(tables), np.concatenate(iterations), world, [place.name])
+            yield Drives(place, concatenated(tables), np.concatenate(iterations), names=[place.name])
 
-    def _recognise_other_worlds(self) -> None:
-        """Name the worlds of races on another than the last one's, which alone is in the file of parameters."""
-        for kind in {drives.place.kind for drives in self.drives} - {TRAINING}:
-            races = [drives for drives in self.drives if drives.place.kind == kind]
-            last = max(races, key=lambda drives: natural(drives.place.name))
-            last_m = last.table["track_len"].to_numpy()[:1]
-            for drives in races:
-                length_m = drives.table["track_len"].to_numpy()[:1]
-                if drives.world and not np.allclose(length_m, last_m, atol=_SAME_LENGTH_M):
-                    drives.world = _world_of(drives)
+    def _name_worlds(self) -> None:
+        """Name the worlds that no log names by the files of parameters; of races these name the last one's only."""
+        last_m: dict[str, Any] = {}
+        for drives in sorted(self.drives, key=lambda drives: natural(drives.place.name), reverse=True):
+            kind, length_m = drives.place.kind, drives.table["track_len"].to_numpy()[:1]
+            if kind != TRAINING:
+                last_m.setdefault(kind, length_m)
+            world = self._parts.world(kind, drives.place.worker)
+            if drives.world or not world:
+                continue
+            if np.allclose(length_m, last_m.get(kind, length_m), atol=_SAME_LENGTH_M):
+                drives.world = world
+            else:
+                drives.world = _world_of(drives)
 
     def _add_log(self, number: int, files: Sequence[LogFile], log: TrainingLog) -> None:
         """Add the drives of a log, unless they are known already from CSVs or another log."""
@@ -133,7 +136,6 @@ class JoinedSteps:
                 other.world = log.world or other.world
                 other.names.append(place.name)
         if left.all():
-            mine.world = mine.world or self._parts.world(place.kind, place.worker)
             self.drives.append(mine)
         elif left.any() and not alike:
             self.drives.append(mine.choose(left))

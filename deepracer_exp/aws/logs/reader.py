@@ -280,7 +280,7 @@ class _Assembly:
                     self._leave_out(file, "episodes", gone)
                 counted = _iterations_by_trial(episodes)
                 keys = [(number, worker, row["episode"]) for row in episodes]
-                # Trials tell iterations apart; which ones they are, the traced episode before each says.
+                # Trials say where an iteration begins; its number is that of the traced episode before.
                 traced = [
                     self.iteration_of[numbers[key]] - index
                     if row["phase"] == TRAINING and key in numbers
