@@ -216,7 +216,6 @@ def test_tracks_finds_the_fastest_lap_and_writes_its_line(call, tmp_path, monkey
         (["tracks", "reinvent_base", "--line", "line.json"], "line.json"),
         (["tracks", "--fastest"], "tracks NAME --fastest"),
         (["tracks", "car=deepracer_v5"], "tracks NAME"),
-        (["tracks", "reinvent_base", "--video", "lap.mp4"], "--fastest"),
         (["tracks", "reinvent_base", "--fastest", "car=fast"], "car=fast"),
     ],
 )

@@ -137,7 +137,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     if trace is not None and (trace.is_file() or (trace.is_dir() and any(trace.iterdir()))):
         raise BadInput(f"--trace {trace}", "is there already and not empty", "a new or an empty folder")
     if video is not None:
-        choose_graphics()
+        _choose_graphics()
 
     from deepracer_exp.evaluation.run_evaluation import evaluate_run
 
@@ -302,7 +302,7 @@ Every checkpoint drives the same trials, on the usual and on held-out conditions
 """
 
 
-def choose_graphics() -> None:
+def _choose_graphics() -> None:
     """Set MUJOCO_GL, which MuJoCo reads when it is imported, to a library that this machine has, unless it is set.
 
     Raises:

@@ -8,10 +8,8 @@ from typing import TYPE_CHECKING
 from deepracer_exp.errors import BadInput, count, writing
 
 from .arguments import add_command, add_overrides, is_override
-from .evaluate import choose_graphics
 from .exchange import picture_file
 from .output import (
-    check_file,
     is_compiled_first,
     plain_console,
     print_notes,
@@ -63,7 +61,6 @@ def add_commands(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
         action="store_true",
         help="find the fastest lap of the car; picture and line are then those of the lap, with its speed",
     )
-    parser.add_argument("--video", metavar="FILE", help="film the fastest lap (.mp4)")
 
 
 ROUTES = (".npy", ".yaml", ".yml")
@@ -83,11 +80,9 @@ def _tracks(args: argparse.Namespace) -> int:
         args.name, args.overrides = None, [args.name, *args.overrides]
     if words := [word for word in args.overrides if not is_override(word)]:
         raise BadInput(f"unrecognized arguments: {' '.join(words)}; see `deepracer-exp tracks --help`")
-    if args.video is not None and not args.fastest:
-        raise BadInput("--video: films a lap; accepted with --fastest")
     if args.name is not None:
         _show_track(args)
-    elif wanted := args.output or args.line or args.video or next(iter(args.overrides), None):
+    elif wanted := args.output or args.line or next(iter(args.overrides), None):
         raise BadInput(f"tracks: no track for {wanted}; accepted: tracks NAME")
     elif args.fastest:
         raise BadInput("tracks --fastest: no track; accepted: tracks NAME --fastest")
@@ -152,9 +147,6 @@ def _show_track(args: argparse.Namespace) -> None:
 
     is_file = Path(args.name).suffix in ROUTES
     check_line_file(args.line)
-    check_file("--video", args.video, ".mp4")
-    if args.video is not None:
-        choose_graphics()
     experiment, track = experiment_on(
         [override_line("track.file" if is_file else "track", args.name), *args.overrides]
     )
@@ -174,8 +166,6 @@ def _show_track(args: argparse.Namespace) -> None:
     print(draw_terminal(track, columns=min(wide, COLUMNS), rows=max(12, min(high - 6, ROWS))))
     if lap is not None:
         _print_lap(lap, experiment)
-        if args.video is not None:
-            _film(lap, track, experiment, args)
     for what, path in (("picture", args.output), ("racing line" if lap is None else "its line", args.line)):
         if path is not None:
             print(f"\n{what}: {path}")
@@ -251,38 +241,6 @@ def _line_table(lap: "FastestLap") -> "pd.DataFrame":
     import pandas as pd
 
     return pd.DataFrame({name: lap.column(name) for name in ("x_m", "y_m", "speed_mps", "progress")})
-
-
-def _film(lap: "FastestLap", track: "Track", experiment: "Experiment", args: argparse.Namespace) -> None:
-    import numpy as np
-
-    from deepracer_exp.evaluation.film import Lap
-    from deepracer_exp.evaluation.race_protocol import Attempt
-    from deepracer_exp.evaluation.video import write_video
-
-    attempt = Attempt(
-        trial=0,
-        begin_s=0.0,
-        time_s=lap.lap_time_s,
-        penalty_s=0.0,
-        resets=0,
-        progress=100.0,
-        end="lap_complete",
-    )
-    film_lap = Lap(
-        attempt=attempt,
-        track=track,
-        title=f"{track.title} · fastest lap",
-        steering_rad=np.radians(lap.column("steering_deg")),
-        time_s=lap.column("time_s"),
-        x_m=lap.column("x_m"),
-        y_m=lap.column("y_m"),
-        yaw_rad=lap.column("yaw_rad"),
-        speed_mps=lap.column("speed_mps"),
-        progress=lap.column("progress"),
-    )
-    write_video(Path(args.video), film_lap, experiment.car, plain_console(stderr=True))
-    print(f"\nfilm: {args.video}")
 
 
 def _measures(name: str) -> tuple[float, float]:
