@@ -43,6 +43,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from deepracer_exp.commands.export.car_check import CAR, SIMULATOR, car_protocols
 from deepracer_exp.commands.export.car_converter import NEEDED, Conversion, compare_in_openvino, has_openvino
 from deepracer_exp.commands.export.car_export import car_archive
 from deepracer_exp.commands.export.onnx import DeployedPolicy
@@ -52,7 +53,6 @@ from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.errors import BadInput
 from deepracer_exp.evaluation.evaluator import Evaluator
 from deepracer_exp.evaluation.results import NOTHING, USUAL
-from deepracer_exp.evaluation.run_evaluation import CAR, SIMULATOR, car_protocols
 from deepracer_exp.runs.stored_run import StoredRun
 
 from .camera import read_frames

@@ -3,7 +3,7 @@
 import datetime
 import json
 from collections.abc import Callable, Container, Mapping, Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,10 @@ from rich.console import Console
 from rich.table import Table
 from tensordict import TensorDict
 
-from deepracer_exp.aws.models.car_controls import full_scale, throttle
-from deepracer_exp.config.evaluation import EvaluationConfig, RealCarConfig
+from deepracer_exp.config.evaluation import EvaluationConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.named import tracks_of
 from deepracer_exp.config.running import MLflowTracking
-from deepracer_exp.env.action_space import build_action_space, metadata_of
 from deepracer_exp.env.others.head_to_head import HeadToHead
 from deepracer_exp.env.race import Race
 from deepracer_exp.errors import RunFailed, count, writing
@@ -38,9 +36,6 @@ from .trace_recorder import TraceRecorder
 
 _TIMES = ("lap s", "median", "best", "std", "score s")
 _MINOR = ("median", "std", "score s", "zig-zag /m")
-SIMULATOR, CAR = "simulator", "car"
-"""Names of the compared races, beside the parts of `RealCarConfig`."""
-_PARTS = tuple(field.name for field in fields(RealCarConfig))
 
 
 def results_table(
@@ -97,14 +92,14 @@ def write_evaluation(
     evaluation: Evaluation,
     config: EvaluationConfig,
     stored: StoredPolicy,
-    car: Mapping[str, Evaluation] | None = None,
+    car: Mapping[str, Any] | None = None,
     places: Mapping[str, Sequence[Standing]] | None = None,
     rival: tuple[str, str] | None = None,
 ) -> Path:
     """Write `evaluations/<time>.json` into a run's folder and return it.
 
-    `car` and `places` are the results of `race_car_parts` and `official_places`; `rival` names the run and checkpoint
-    that drove the other car, None: there was none, or the policy itself.
+    `car` are the figures of a check for the car, `places` the results of `official_places`; `rival` names the run and
+    checkpoint that drove the other car, None: there was none, or the policy itself.
 
     Raises:
         RunFailed: the file cannot be written.
@@ -119,7 +114,7 @@ def write_evaluation(
     if rival is not None:
         content["rival"] = dict(zip(("run", "checkpoint"), rival, strict=True))
     if car is not None:
-        content["real_car"] = car_figures(car)
+        content["real_car"] = car
     if places:
         content["boards"] = {
             track: [place.as_dict() for place in on_track] for track, on_track in places.items()
@@ -201,19 +196,11 @@ def evaluate_run(
         record if recorders else None,
         None if rival is None else rival.networks.policy,
     )
-    car = None
-    if config.real_car is not None:
-        car = race_car_parts(run.experiment, config, stored.networks.policy, evaluation)
     places = official_places(run.experiment, config, evaluation)
     against = None if plan.rival is None or rival is None else (plan.rival.path.name, rival.path.name)
-    file = write_evaluation(run.path, evaluation, config, stored, car, places, against)
+    file = write_evaluation(run.path, evaluation, config, stored, places=places, rival=against)
     trained = trained_on(run.experiment, config, evaluation)
     out.print(results_table(evaluation, config, trained, out))
-    if car is not None:
-        out.print()
-        out.print(car_table(car))
-        for line in explain_controls(run.experiment, config):
-            out.print(f"  {line}", soft_wrap=True)
     for track, on_track in places.items():
         laps = next(group for group in evaluation.groups if group.track == track and group.condition == USUAL)
         part = f"; {len(laps.lap_times_s)} of {len(laps.decided)} laps were complete" * (laps.lap_share < 1)
@@ -302,92 +289,3 @@ def _metrics(evaluation: Evaluation, trained_on: Sequence[str]) -> dict[str, flo
         else:
             metrics[evaluate_metric("held_out_completion", label)] = group.completion
     return metrics
-
-
-def car_protocols(config: EvaluationConfig) -> dict[str, EvaluationConfig]:
-    """Return the protocol without any part of the real car and with each part alone, by name."""
-    assert config.real_car is not None
-    none = RealCarConfig(**dict.fromkeys(_PARTS))
-    chosen = [name for name in _PARTS if getattr(config.real_car, name) is not None]
-    alone = {name: replace(none, **{name: getattr(config.real_car, name)}) for name in chosen}
-    # A single part alone is the whole car.
-    shown = alone if len(alone) > 1 else {}
-    return {
-        SIMULATOR: replace(config, real_car=None),
-        **{name: replace(config, real_car=real_car) for name, real_car in shown.items()},
-    }
-
-
-def race_car_parts(
-    experiment: Experiment, config: EvaluationConfig, policy: torch.nn.Module, of_car: Evaluation
-) -> dict[str, Evaluation]:
-    """Race the policy in the plain simulator and with each part of the car alone; add `of_car`, with all parts."""
-    evaluations = {
-        name: Evaluator(experiment, protocol)(policy) for name, protocol in car_protocols(config).items()
-    }
-    return {**evaluations, CAR: of_car}
-
-
-def car_figures(evaluations: Mapping[str, Evaluation]) -> dict[str, dict[str, Any]]:
-    """Return `lap_share`, `completion` (0 to 1) and `lap_time_s` (None on several tracks) of each, JSON types."""
-    figures = {}
-    for name, evaluation in evaluations.items():
-        group = evaluation.on(USUAL)
-        figures[name] = {
-            "lap_share": group.lap_share,
-            "completion": group.completion / 100,
-            "lap_time_s": group.mean_lap_time_s if len(evaluation.tracks) == 1 else None,
-        }
-    return figures
-
-
-def car_table(evaluations: Mapping[str, Evaluation]) -> Table:
-    """Return the losses under usual conditions as a table: simulator, each part of the car alone, all of them."""
-    figures = car_figures(evaluations)
-    base = figures[SIMULATOR]
-    shown = Table(
-        box=None,
-        pad_edge=False,
-        title="from the simulator to the car",
-        title_justify="left",
-        caption="randomization=real_car has these parts in the training",
-        caption_justify="left",
-    )
-    for name in ("as on the car", "laps %", "lost %", "done %", "lap s", "lost s"):
-        shown.add_column(name, justify="left" if name == "as on the car" else "right", no_wrap=True)
-    names = {SIMULATOR: "nothing", CAR: "all"}
-    for name, figure in figures.items():
-        lap_s, base_s = figure["lap_time_s"], base["lap_time_s"]
-        lost_s = None if name == SIMULATOR or None in (lap_s, base_s) else lap_s - base_s
-        shown.add_row(
-            names.get(name, name),
-            f"{100 * figure['lap_share']:.0f}",
-            NOTHING if name == SIMULATOR else f"{100 * (base['lap_share'] - figure['lap_share']):.0f}",
-            f"{100 * figure['completion']:.1f}",
-            number(lap_s, 2),
-            NOTHING if lost_s is None else f"{lost_s:+.2f}",
-        )
-    return shown
-
-
-def explain_controls(experiment: Experiment, config: EvaluationConfig) -> list[str]:
-    """Describe the car's response to the action space."""
-    controls = None if config.real_car is None else config.real_car.controls
-    if controls is None:
-        return []
-    actions = build_action_space(experiment.action_space)
-    scale = full_scale(metadata_of(actions))
-    top_mps = controls.full_throttle_mps or scale.speed_mps
-    half_mps = top_mps * float(throttle(0.5 * scale.speed_mps, scale.speed_mps))
-    lines = [
-        f"steering: {scale.steering_deg:g} degrees are full lock, {controls.full_lock_deg:g} degrees on the car",
-        f"speed: {scale.speed_mps:g} m/s are full throttle, {top_mps:g} m/s on the car; half of it becomes "
-        f"{half_mps:g} m/s",
-    ]
-    if 0 < scale.steering_deg != controls.full_lock_deg:
-        lines[0] += f": {controls.full_lock_deg / scale.steering_deg:.2g} times as much"
-    if -actions.low[0] > scale.steering_deg > 0:
-        lines.append(
-            f"the servo refuses steering beyond {-scale.steering_deg:g} degrees and keeps the last angle"
-        )
-    return lines

@@ -39,6 +39,10 @@ def test_the_usual_laps_have_the_place():
 def test_a_track_without_a_board_driven_the_other_way_or_by_the_real_car_has_none():
     assert places(driven("reinvent_base", 10.0)) == {}
     assert places(driven("Albert", 14.0), overrides=("track.direction=reversed",)) == {}
+    both = places(
+        driven("Albert", 14.0), driven("Albert reversed", 14.0), overrides=("track.direction=alternate",)
+    )
+    assert list(both) == ["Albert"]
     assert places(driven("Albert")) == {}
     real = compose_experiment(["evaluation=real_car"])[0].evaluation.real_car
     assert places(driven("Albert", 14.0), real_car=real) == {}

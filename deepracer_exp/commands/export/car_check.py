@@ -2,8 +2,9 @@
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,9 +19,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from deepracer_exp.agents.actor_critic import PolicyNetworks
 from deepracer_exp.aws.models.car_archive import describe_commands
-from deepracer_exp.config.evaluation import EvaluationConfig
+from deepracer_exp.aws.models.car_controls import full_scale, throttle
+from deepracer_exp.config.evaluation import EvaluationConfig, RealCarConfig
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.env.action_space import ActionSpace
+from deepracer_exp.env.action_space import ActionSpace, build_action_space, metadata_of
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.trace_columns import PACKED, STATUS_CODE
 from deepracer_exp.errors import RunFailed, writing
@@ -29,14 +31,7 @@ from deepracer_exp.evaluation.film import LapRecorder, best_attempt, png
 from deepracer_exp.evaluation.plan import EvaluatePlan
 from deepracer_exp.evaluation.race_protocol import RaceProtocol
 from deepracer_exp.evaluation.results import USUAL, Evaluation, number
-from deepracer_exp.evaluation.run_evaluation import (
-    CAR,
-    SIMULATOR,
-    car_figures,
-    car_protocols,
-    explain_controls,
-    write_evaluation,
-)
+from deepracer_exp.evaluation.run_evaluation import write_evaluation
 from deepracer_exp.evaluation.zigzag import CURE, ZIGZAG_DEG, ZIGZAG_PER_M, ZigZag
 from deepracer_exp.files import atomic_write
 from deepracer_exp.reports.pages.picture_changes import TriedPictures, pictures_sheet, try_pictures
@@ -48,6 +43,9 @@ from .car_converter import NEEDED, Conversion, compare_in_openvino, has_openvino
 from .car_export import CarArchive, car_archive
 from .onnx import DeployedPolicy
 
+SIMULATOR, CAR = "simulator", "car"
+"""Names of the compared races, beside the parts of `RealCarConfig`."""
+_PARTS = tuple(field.name for field in fields(RealCarConfig))
 LEAST_ON_CAR = 0.9
 """Share of complete laps wanted with each part of the car and with all; in the simulator it is `RELIABLE`."""
 LEAST_FACTOR = 4.0
@@ -104,7 +102,7 @@ class CarCheck:
                 f"the network is too slow: real-time factor {self.factor:.1f}, wanted {LEAST_FACTOR:g}; train with "
                 "network=cnn_small"
             )
-        figures = car_figures({name: laps.evaluation for name, laps in self.laps.items()})
+        figures = car_figures(self.laps)
         shares = {name: figure["lap_share"] for name, figure in figures.items()}
         weak = [name for name in self.laps if name != SIMULATOR and shares[name] < LEAST_ON_CAR]
         if not shares[SIMULATOR]:  # results of such a policy do not apply to a trained one
@@ -139,6 +137,33 @@ class CarCheck:
                 "pictures of randomization=real_car"
             )
         return steps
+
+
+def car_protocols(config: EvaluationConfig) -> dict[str, EvaluationConfig]:
+    """Return the protocol without any part of the real car and with each part alone, by name."""
+    assert config.real_car is not None
+    none = RealCarConfig(**dict.fromkeys(_PARTS))
+    chosen = [name for name in _PARTS if getattr(config.real_car, name) is not None]
+    alone = {name: replace(none, **{name: getattr(config.real_car, name)}) for name in chosen}
+    # A single part alone is the whole car.
+    shown = alone if len(alone) > 1 else {}
+    return {
+        SIMULATOR: replace(config, real_car=None),
+        **{name: replace(config, real_car=real_car) for name, real_car in shown.items()},
+    }
+
+
+def car_figures(laps: Mapping[str, CarLaps]) -> dict[str, dict[str, Any]]:
+    """Return `lap_share`, `completion` (0 to 1) and `lap_time_s` (None on several tracks) of each, JSON types."""
+    figures = {}
+    for name, driven in laps.items():
+        group = driven.evaluation.on(USUAL)
+        figures[name] = {
+            "lap_share": group.lap_share,
+            "completion": group.completion / 100,
+            "lap_time_s": group.mean_lap_time_s if len(driven.evaluation.tracks) == 1 else None,
+        }
+    return figures
 
 
 def check_run(plan: EvaluatePlan, picture: Path | None, out: Console, err: Console) -> CarCheck:
@@ -178,8 +203,7 @@ def check_run(plan: EvaluatePlan, picture: Path | None, out: Console, err: Conso
         try_pictures(policy, acted, car.actions),
         _converted(archive, stored.networks, car.actions, acted) if has_openvino() else None,
     )
-    evaluations = {name: driven.evaluation for name, driven in laps.items()}
-    results = write_evaluation(run.path, laps[CAR].evaluation, config, stored, evaluations)
+    results = write_evaluation(run.path, laps[CAR].evaluation, config, stored, car_figures(laps))
     files = {}
     if len(check.pictures.bad):
         file = picture or run.path / FILMS / f"{stored.path.name}-car.png"
@@ -240,6 +264,29 @@ def print_check(
         say(f"pictures that decide badly, by what changed: {check.pictures.by_change()}")
 
 
+def explain_controls(experiment: Experiment, config: EvaluationConfig) -> list[str]:
+    """Describe the car's response to the action space."""
+    controls = None if config.real_car is None else config.real_car.controls
+    if controls is None:
+        return []
+    actions = build_action_space(experiment.action_space)
+    scale = full_scale(metadata_of(actions))
+    top_mps = controls.full_throttle_mps or scale.speed_mps
+    half_mps = top_mps * float(throttle(0.5 * scale.speed_mps, scale.speed_mps))
+    lines = [
+        f"steering: {scale.steering_deg:g} degrees are full lock, {controls.full_lock_deg:g} degrees on the car",
+        f"speed: {scale.speed_mps:g} m/s are full throttle, {top_mps:g} m/s on the car; half of it becomes "
+        f"{half_mps:g} m/s",
+    ]
+    if 0 < scale.steering_deg != controls.full_lock_deg:
+        lines[0] += f": {controls.full_lock_deg / scale.steering_deg:.2g} times as much"
+    if -actions.low[0] > scale.steering_deg > 0:
+        lines.append(
+            f"the servo refuses steering beyond {-scale.steering_deg:g} degrees and keeps the last angle"
+        )
+    return lines
+
+
 _NAMES = {SIMULATOR: "in the simulator", CAR: "as on the car"}
 
 
@@ -256,7 +303,7 @@ def laps_table(laps: Mapping[str, CarLaps]) -> Table:
     shown = Table(box=None, pad_edge=False)
     for name in ("as on the car", "laps %", "wanted", "edge cm", "lap s", "zig-zag /m"):
         shown.add_column(name, justify="left" if name == "as on the car" else "right", no_wrap=True)
-    figures = car_figures({name: driven.evaluation for name, driven in laps.items()})
+    figures = car_figures(laps)
     names = {SIMULATOR: "nothing", CAR: "all"}
     for name, driven in laps.items():
         wanted = RELIABLE if name == SIMULATOR else LEAST_ON_CAR

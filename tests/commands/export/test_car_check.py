@@ -1,6 +1,8 @@
 """The check before a drive with the physical car."""
 
 import io
+import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from PIL import Image
 from rich.console import Console
 from tensordict import TensorDict
 
-from deepracer_exp.commands.export.car_check import CarCheck, CarLaps, print_check
+from deepracer_exp.commands.export.car_check import CAR, SIMULATOR, CarCheck, CarLaps, print_check
 from deepracer_exp.commands.export.car_converter import Conversion
 from deepracer_exp.commands.export.car_export import CarArchive, car_actions
 from deepracer_exp.config.compose import compose_evaluation, compose_experiment
@@ -17,7 +19,6 @@ from deepracer_exp.config.driving import CameraConfig
 from deepracer_exp.env.action_space import DiscreteActions
 from deepracer_exp.evaluation.race_protocol import Attempt
 from deepracer_exp.evaluation.results import USUAL, Evaluation, TrialGroup
-from deepracer_exp.evaluation.run_evaluation import CAR, SIMULATOR
 from deepracer_exp.evaluation.zigzag import ZigZag
 from deepracer_exp.reports.pages.picture_changes import CHANGES, pictures_sheet, spread_out, try_pictures
 
@@ -187,6 +188,10 @@ def test_the_command_tells_what_will_happen_on_the_car_and_ends_with_what_to_do(
     for part in ("nothing", "picture", "timing", "controls", "all"):
         assert f"\n{part} " in ended.stdout
     assert "  driving in the simulator\n" in ended.stderr
+    (file,) = [line.split()[1] for line in ended.stdout.splitlines() if line.startswith("  results ")]
+    parts = json.loads(Path(file).read_text())["real_car"]
+    assert list(parts) == [SIMULATOR, "picture", "timing", "controls", CAR]
+    assert all(0 <= part["completion"] <= 1 for part in parts.values())
     last = ended.stdout.splitlines()[-1]
     assert last == "ready" or last.startswith("not ready: ")
     bad = "pictures  bad.png" in ended.stdout
