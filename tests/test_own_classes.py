@@ -9,14 +9,11 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-import torch
 import yaml
 
 from deepracer_exp import load_policy
-from deepracer_exp.config import acting, own_class
+from deepracer_exp.config import acting
 from deepracer_exp.config.compose import compose_experiment
-from deepracer_exp.config.options import options
-from deepracer_exp.config.own_class import build_own
 from deepracer_exp.runs.next_steps import command_line, next_steps
 
 from .conftest import IN_PROCESS, call_in
@@ -255,24 +252,6 @@ def test_a_file_of_the_working_folder_replaces_no_installed_module(tmp_path):
     sys.modules.pop("colorsys", None)
     ended = call_in(tmp_path, "train", *IN_PROCESS, "network=colorsys:Net")
     ended.assert_bad_input("module 'colorsys' has no attribute 'Net'")
-
-
-def test_an_entry_point_is_an_option_that_stored_runs_may_use(tmp_path, monkeypatch):
-    write_examples(tmp_path)
-    package = tmp_path / "my_package-1.0.dist-info"
-    package.mkdir()
-    (package / "METADATA").write_text("Metadata-Version: 2.1\nName: my_package\nVersion: 1.0\n")
-    (package / "entry_points.txt").write_text("[deepracer_exp.network]\nresnet = my_network:ResidualNet\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    own_class.registered.cache_clear()
-    try:
-        assert "resnet" in options("network")
-        experiment, _ = compose_experiment(["network=resnet", "network.kwargs.width=8"])
-        acting._named.clear()
-        net = build_own(experiment.network, "network.target", torch.nn.Module, 3, 2)
-        assert net(torch.zeros(3)).shape == (2,)
-    finally:
-        own_class.registered.cache_clear()
 
 
 @pytest.mark.slow

@@ -11,8 +11,6 @@ from deepracer_exp.aws.worlds.catalogue import worlds
 from deepracer_exp.errors import BadInput, nearest
 from deepracer_exp.files import read_bytes, read_text
 
-from .own_class import registered
-
 SWEEP = "sweep"
 """The group whose options are the ready-made studies."""
 MOST_LISTED = 24
@@ -107,11 +105,11 @@ def groups(entry: str = "train") -> list[str]:
 
 
 def options(group: str) -> list[str]:
-    """Return the sorted names of a group's options; the service's worlds and entry points have no file."""
+    """Return the sorted names of a group's options; the service's worlds have no file."""
     files = {path.stem for folder in conf_dirs() for path in (folder / group).glob("*.yaml")}
     if group == SWEEP:
         files |= sweep_files().keys()
-    return sorted(files | (worlds() if group == "track" else registered(group)).keys())
+    return sorted(files | (set(worlds()) if group == "track" else set()))
 
 
 def listed(group: str, names: Sequence[str]) -> str:

@@ -1,7 +1,7 @@
-"""Classes of your own in the configuration, by `package.module:Class` or by an entry point.
+"""Classes of your own in the configuration, by `package.module:Class`.
 
-Code is imported only if the user names its class or has trained with it before (`acting`), or an installed package
-registers it. A stored run names its classes only as text: a copied or downloaded run loads nothing by itself.
+Code is imported only if the user names its class or has trained with it before (`acting`). A stored run names its
+classes only as text: a copied or downloaded run loads nothing by itself.
 """
 
 import importlib
@@ -10,8 +10,6 @@ import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -22,7 +20,7 @@ from deepracer_exp.errors import BadInput, reading
 from . import acting
 
 GROUPS = ("network", "algorithm", "lr_schedule", "observation", "stopping", "tracking")
-"""Groups whose option may be a class of your own. Entry points are registered under `deepracer_exp.GROUP`."""
+"""Groups whose option may be a class of your own."""
 OF_POLICY = ("network", "observation")
 """Groups that a stored policy needs in an evaluation or an export."""
 REFERENCE = r"[A-Za-z_][\w.]*:[A-Za-z_]\w*"
@@ -52,24 +50,15 @@ OURS_OR_OWN = Discriminator(lambda value: "own" if isinstance(value, dict) and "
 
 
 def own_option(group: str, name: str) -> dict[str, Any] | None:
-    """Return the values of the option `GROUP=package.module:Class` or of an entry point; None if it is neither."""
-    if group not in GROUPS:
+    """Return the values of the option `GROUP=package.module:Class`; None if it is none."""
+    if group not in GROUPS or not re.fullmatch(REFERENCE, name):
         return None
-    target = name if re.fullmatch(REFERENCE, name) else registered(group).get(name)
-    if target is None:
-        return None
-    option = {"target": target, "kwargs": {}}
+    option = {"target": name, "kwargs": {}}
     if group == "algorithm":
         return {"defaults": ["ppo", "_self_"], **option}
     if group == "observation":
         return {"defaults": ["features", "_self_"], "parts": [option]}
     return option
-
-
-@cache
-def registered(group: str) -> dict[str, str]:
-    """Return the classes that installed packages register for a group, by name."""
-    return {point.name: point.value for point in entry_points(group=f"deepracer_exp.{group}")}
 
 
 def allow(values: Any) -> None:
@@ -96,8 +85,7 @@ def own_classes(config: Mapping[str, Any], groups: Sequence[str] = GROUPS) -> It
 
 def named_again(config: Mapping[str, Any], groups: Sequence[str] = GROUPS) -> list[str]:
     """Return the overrides that let a command import the classes of a stored run."""
-    classes = own_classes(config, groups)
-    return [f"{group}.target={target}" for group, target in classes if not _is_registered(target)]
+    return [f"{group}.target={target}" for group, target in own_classes(config, groups)]
 
 
 def load_class(target: str, key: str) -> type:
@@ -108,11 +96,10 @@ def load_class(target: str, key: str) -> type:
     Raises:
         BadInput: only a stored run or study names it, or it cannot be imported.
     """
-    if not _is_registered(target) and not acting.class_of(target).is_own:
+    if not acting.class_of(target).is_own:
         raise BadInput(
             f"{key}={target}: named by a stored run, which imports no code by itself, and not a class that you have "
-            f"trained with, or changed since; if you trust it, repeat {key}={target} on the command line, or install a "
-            "package that registers it as an entry point"
+            f"trained with, or changed since; if you trust it, repeat {key}={target} on the command line"
         )
     # At the end: a file of the working folder never replaces an installed module.
     if (folder := str(Path.cwd())) not in sys.path:
@@ -146,10 +133,6 @@ def build_own(chosen: OwnClass, key: str, base: type[Base], *arguments: Any) -> 
         ) from error
     with reading(f"{key}={chosen.target}"):
         return kind(*arguments, **chosen.kwargs)
-
-
-def _is_registered(target: str) -> bool:
-    return any(target in registered(group).values() for group in GROUPS)
 
 
 def _references(values: Any) -> Iterator[str]:
