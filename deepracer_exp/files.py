@@ -104,14 +104,14 @@ def read_yaml(
     `load` parses the text, None: into plain values; `raw` is as for `read_json`.
 
     Raises:
-        BadInput: it cannot be read, is too large, not YAML, contains itself, or has more values (each alias counted in
-            full) or more levels than a hand-written file.
+        BadInput: it cannot be read, is too large, not YAML, has aliases, or has more values or levels than a
+            hand-written file.
     """
     raw = read_bytes(path, accepted) if raw is None else raw
     _check_size(path, len(raw), accepted, SETTINGS_BYTES)
     with reading(path, accepted, "not YAML"):
         text = raw.decode("utf-8-sig")
-        _check_structure(text)
+        _check_structure(path, text)
         return _LOADER(text).get_single_data() if load is None else load(text)
 
 
@@ -171,31 +171,13 @@ def _check_size(path: str | Path, size: int, accepted: str, most_bytes: int) -> 
         raise BadInput(path, f"is larger than {most_bytes // 2**20} MiB", accepted)
 
 
-def _check_structure(text: str) -> None:
-    """Refuse files that would take forever to build: a few lines of aliases can stand for billions of values."""
-    anchors: dict[str, tuple[int, int]] = {}
-    open_nodes: list[list[Any]] = [[None, 0, 0]]  # anchor, values and levels of each that is open
+def _check_structure(path: str | Path, text: str) -> None:
+    """Refuse files that would take forever to build, and aliases, of which a few lines stand for billions of values."""
+    values = levels = 0
     for event in yaml.parse(text, _LOADER):
-        if isinstance(event, yaml.CollectionStartEvent):
-            open_nodes.append([event.anchor, 1, 0])
-            if len(open_nodes) > _DEEPEST:
-                raise ValueError(f"more than {_DEEPEST} levels of lists and mappings")
-            continue
-        if isinstance(event, yaml.CollectionEndEvent):
-            anchor, values, levels = open_nodes.pop()
-            levels += 1
-        elif isinstance(event, yaml.ScalarEvent):
-            anchor, values, levels = event.anchor, 1, 0
-        elif isinstance(event, yaml.AliasEvent):
-            if event.anchor not in anchors:
-                raise ValueError(f"alias *{event.anchor} refers to something that is incomplete or missing")
-            anchor, (values, levels) = None, anchors[event.anchor]
-        else:
-            continue
-        if anchor is not None:
-            anchors[anchor] = values, levels
-        parent = open_nodes[-1]
-        parent[1] += values
-        parent[2] = max(parent[2], levels)
-        if parent[1] > _MOST_VALUES or len(open_nodes) + parent[2] > _DEEPEST:
-            raise ValueError(f"more than {_MOST_VALUES:,} values or {_DEEPEST} levels")
+        if isinstance(event, yaml.AliasEvent):
+            raise BadInput(path, f"has an alias, *{event.anchor}", "the value itself")
+        values += isinstance(event, yaml.NodeEvent)
+        levels += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if values > _MOST_VALUES or levels > _DEEPEST:
+            raise BadInput(path, f"has more than {_MOST_VALUES:,} values or {_DEEPEST} levels")
