@@ -1,8 +1,9 @@
 """`deepracer-exp analyze`: how a training went, from its logs."""
 
 import argparse
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from deepracer_exp.errors import BadInput, count, writing
 from deepracer_exp.runs.run_files import REPORT
@@ -19,7 +20,6 @@ from .pages import (
 )
 
 if TYPE_CHECKING:
-    from deepracer_exp.config.car import CarConfig
     from deepracer_exp.reports.tables.log_view import LogView
 
 _EPILOG = """\
@@ -99,6 +99,8 @@ def _analyze(args: argparse.Namespace) -> int:
 
         reward = named_reward_source(args.reward)
 
+    from deepracer_exp.config.named import service_car
+    from deepracer_exp.config.parse import parse_experiment
     from deepracer_exp.reports.findings import findings
     from deepracer_exp.reports.pages.log_report import LogPage, write_log_page
     from deepracer_exp.reports.tables.log_tables import headline, other_tracks, result_in_words, trainings
@@ -115,11 +117,12 @@ def _analyze(args: argparse.Namespace) -> int:
         print(f"{view.name}: {headline(view)}\n")
         print(*written, sep="\n")
         return 0
-    try:
-        config = read_config(place) if is_traced_run(place) else {}
-    except BadInput:  # the page lists which files could not be read
-        config = {}
-    car = _car(config)
+    config, car = {}, service_car()
+    if is_traced_run(place):
+        # The page lists files that cannot be read; cars of another version had the same dimensions.
+        with suppress(BadInput):
+            config = read_config(place)
+            car = parse_experiment(config).car
     view, terms = run_terms(prepare(log, args.track), car)
     best = None
     if config:
@@ -180,17 +183,6 @@ def _write_laps_asked_for(args: argparse.Namespace, view: "LogView", episode: in
             write_line(Path(args.line), line[0])
         written.append(f"  line  {args.line} ({line[1]})")
     return written
-
-
-def _car(config: dict[str, Any]) -> "CarConfig":
-    """Return the car of a run of ours; the service's has the dimensions of the default one."""
-    from deepracer_exp.config.named import service_car
-    from deepracer_exp.config.parse import parse_experiment
-
-    try:
-        return parse_experiment(config).car if config else service_car()
-    except BadInput:  # another version, whose cars had the same dimensions
-        return service_car()
 
 
 def _episode(lap: str, line: str | None) -> int:
