@@ -23,7 +23,7 @@ CASES = {
     ("train", "track=../../x"): "track=../../x",
     ("train", "reward.file=pipe"): "pipe: is a pipe",
     ("train", "track.file=nothing.npy"): "nothing.npy",
-    ("train", "action_space.file=pipe"): "pipe: is a pipe",
+    ("train", "action_space.file=pipe"): "action_space.file=pipe: is a pipe",
     ("train", "custom_files=nowhere"): "nowhere",
     ("train", "evaluation.tracks=[../x]"): "evaluation.tracks=../x",
     ("train", "evaluation.held_out=../x"): "evaluation.held_out=../x",

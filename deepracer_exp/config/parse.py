@@ -50,7 +50,11 @@ def take_over_files(values: dict[str, Any]) -> dict[str, str]:
     file = space.get("file") if isinstance(space, dict) else None
     if not isinstance(file, str):
         return {}
-    values["action_space"] = {**action_space_values(read_model_metadata(file)), "file": None}
+    try:
+        metadata = read_model_metadata(file)
+    except BadInput as error:
+        raise BadInput(f"action_space.file={error}") from None
+    values["action_space"] = {**action_space_values(metadata), "file": None}
     return {"action_space": Path(file).stem}
 
 
