@@ -278,8 +278,11 @@ def test_a_sweep_that_ends_in_its_last_stage_resumes_the_clone_and_no_trial(
     running = sweep("sweep.workers=2", "sweep.rerank_laps=2", clone)
     rows = 1 + random.Random(seed).randrange(iterations // 2)
     running.wait_for(
-        lambda: sum(file.read_bytes().count(b"\n") for file in runs.glob("*-clone1/metrics.jsonl")) >= rows,
-        f"{rows} rows of the clone",
+        lambda: (
+            any(runs.glob("*-clone1/checkpoints/0*"))
+            and sum(file.read_bytes().count(b"\n") for file in runs.glob("*-clone1/metrics.jsonl")) >= rows
+        ),
+        f"a checkpoint and {rows} rows of the clone",
     )
     ended_s = {path: path.stat().st_mtime_ns for path in runs.glob("*/summary.json")}
     assert len(ended_s) == TRIALS
