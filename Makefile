@@ -23,7 +23,7 @@ endif
 INSTALL = $(BIN)/uv pip install --compile-bytecode --python $(BIN)/python --constraint constraints.txt
 # A busy machine needs longer than the minute that uv gives each file.
 export UV_COMPILE_BYTECODE_TIMEOUT ?= 900
-# Numba compiles the cars in the first process that drives: half a minute on one core. Those of `tiny` are all alike.
+# Numba compiles the cars in the first process that drives: half a minute on one core. `tiny` alone has no cars that differ.
 WARM = runs=$$(mktemp -d) && { $(BIN)/deepracer-exp train experiment=tiny randomization=mixed tracking=off runs_dir=$$runs >$$runs/log 2>&1 || \
 	{ cat $$runs/log; exit 1; }; } && rm -r $$runs
 

@@ -245,7 +245,7 @@ def push_cars(cars, drives, motion, commands, clock, forces):  # type: ignore[no
             rad/s.
         commands: commanded speed_mps and steering_rad, (N, 2).
         clock: a `Clock`.
-        forces: written: force in the world, N, N, and torque, N m, over the car's `mass_scale`, (N, 3): MuJoCo moves
+        forces: written: force in the world, N, N, and torque, N m, divided by `mass_scale`, (N, 3): MuJoCo moves
             all cars with the configured mass.
     """
     yaw_rad, velocity = motion

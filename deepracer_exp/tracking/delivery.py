@@ -167,7 +167,7 @@ def marked_deleted(run_dir: Path, run_id: str, uri: str | None, runs_dir: Path) 
         yield
         return
     with open_client(f"{run_dir}: nothing was deleted", uri, runs_dir) as client:
-        run = run_if_there(client, run_id)  # gone after `mlflow gc`, or in a store that was made anew
+        run = run_if_there(client, run_id)  # gone after `mlflow gc`, or in a new store
         is_active = run is not None and run.info.lifecycle_stage == "active"
     # A copy of the folder has the same record, which is not its own to delete.
     others = (folder for folder in run_folders(runs_dir) if folder.resolve() != run_dir.resolve())

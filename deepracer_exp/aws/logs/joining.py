@@ -88,7 +88,7 @@ class JoinedSteps:
             yield Drives(place, concatenated(tables), np.concatenate(iterations), names=[place.name])
 
     def _name_worlds(self) -> None:
-        """Name the worlds that no log names by the files of parameters; of races these name the last one's only."""
+        """Take worlds that no log names from the files of parameters, which have that of the last race only."""
         last_m: dict[str, Any] = {}
         for drives in sorted(self.drives, key=lambda drives: natural(drives.place.name), reverse=True):
             kind, length_m = drives.place.kind, drives.table["track_len"].to_numpy()[:1]

@@ -102,7 +102,7 @@ class CarCheck:
                 f"the network is too slow: real-time factor {self.factor:.1f}, wanted {LEAST_FACTOR:g}; train with "
                 "network=cnn_small"
             )
-        figures = car_figures(self.laps)
+        figures = _car_figures(self.laps)
         shares = {name: figure["lap_share"] for name, figure in figures.items()}
         weak = [name for name in self.laps if name != SIMULATOR and shares[name] < LEAST_ON_CAR]
         if not shares[SIMULATOR]:  # results of such a policy do not apply to a trained one
@@ -153,7 +153,7 @@ def car_protocols(config: EvaluationConfig) -> dict[str, EvaluationConfig]:
     }
 
 
-def car_figures(laps: Mapping[str, CarLaps]) -> dict[str, dict[str, Any]]:
+def _car_figures(laps: Mapping[str, CarLaps]) -> dict[str, dict[str, Any]]:
     """Return `lap_share`, `completion` (0 to 1) and `lap_time_s` (None on several tracks) of each, JSON types."""
     figures = {}
     for name, driven in laps.items():
@@ -203,7 +203,7 @@ def check_run(plan: EvaluatePlan, picture: Path | None, out: Console, err: Conso
         try_pictures(policy, acted, car.actions),
         _converted(archive, stored.networks, car.actions, acted) if has_openvino() else None,
     )
-    results = write_evaluation(run.path, laps[CAR].evaluation, config, stored, car_figures(laps))
+    results = write_evaluation(run.path, laps[CAR].evaluation, config, stored, _car_figures(laps))
     files = {}
     if len(check.pictures.bad):
         file = picture or run.path / FILMS / f"{stored.path.name}-car.png"
@@ -256,7 +256,7 @@ def print_check(
         f"a picture takes {1000 * check.network_s:.2f} ms here on one core, {1000 * check.frame_s:.1f} ms pass between "
         "two on the car",
         f"{1 / check.frame_s:g} actions a second, {trained_hz:g} in the training",
-        *explain_controls(experiment, config),
+        *_explain_controls(experiment, config),
     )
     if check.conversion is None:
         say(f"the archive was not tried in OpenVINO, the car's converter: {NEEDED}")
@@ -264,7 +264,7 @@ def print_check(
         say(f"pictures that decide badly, by what changed: {check.pictures.by_change()}")
 
 
-def explain_controls(experiment: Experiment, config: EvaluationConfig) -> list[str]:
+def _explain_controls(experiment: Experiment, config: EvaluationConfig) -> list[str]:
     """Describe the car's response to the action space."""
     controls = None if config.real_car is None else config.real_car.controls
     if controls is None:
@@ -303,7 +303,7 @@ def laps_table(laps: Mapping[str, CarLaps]) -> Table:
     shown = Table(box=None, pad_edge=False)
     for name in ("as on the car", "laps %", "wanted", "edge cm", "lap s", "zig-zag /m"):
         shown.add_column(name, justify="left" if name == "as on the car" else "right", no_wrap=True)
-    figures = car_figures(laps)
+    figures = _car_figures(laps)
     names = {SIMULATOR: "nothing", CAR: "all"}
     for name, driven in laps.items():
         wanted = RELIABLE if name == SIMULATOR else LEAST_ON_CAR
