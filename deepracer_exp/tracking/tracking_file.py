@@ -10,7 +10,7 @@ from pydantic import TypeAdapter
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import atomic_write, read_json_as
-from deepracer_exp.runs.run_files import MLFLOW, TRACKING
+from deepracer_exp.runs.run_files import MLFLOW, TRACKING, read_run_id
 
 Status = Literal["FINISHED", "FAILED", "KILLED"]
 
@@ -140,6 +140,21 @@ def write_recorded(folder: Path, recorded: Recorded, kind: str = "mlflow") -> No
 def note_problem(folder: Path, problem: str) -> None:
     """Mark an ended run as incomplete in MLflow."""
     write_recorded(folder, replace(read_recorded(folder), problem=problem))
+
+
+def is_copy(run_dir: Path) -> bool:
+    """Return whether a run's folder was copied, and the original, which has the run in MLflow, is still there.
+
+    Where all runs were copied as a whole, those beside the copy count.
+
+    Raises:
+        BadInput: a file is missing or invalid.
+    """
+    recorded = Path(read_tracked_run(run_dir).tags.get("run_dir", run_dir))
+    beside = run_dir.parents[1] / recorded.parent.name / recorded.name
+    original = beside if beside.exists() else recorded
+    run_id = read_run_id(run_dir)
+    return run_id is not None and original.resolve() != run_dir.resolve() and read_run_id(original) == run_id
 
 
 def begin_again(folder: Path, run_dir: Path) -> None:

@@ -32,7 +32,7 @@ from deepracer_exp.runs.run_files import (
 )
 from deepracer_exp.tracking.projector import Projector
 from deepracer_exp.tracking.tracker import open_tracker
-from deepracer_exp.tracking.tracking_file import read_tracked_run
+from deepracer_exp.tracking.tracking_file import begin_again, is_copy, read_tracked_run
 from deepracer_exp.training.stopping.stopping_rules import UNDECIDED
 
 from .budget import Budget
@@ -82,6 +82,8 @@ def reopen_run(
             )
         trainer.load(checkpoint, state)
         if (folder.path / TRACKING).exists():
+            if is_copy(folder.path):
+                begin_again(folder.path, folder.path)
             recorded = read_tracked_run(folder.path)
         else:  # killed before it was recorded, or trained with tracking=off
             commit = plan.provenance.get("git_commit")

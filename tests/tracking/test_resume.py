@@ -8,7 +8,7 @@ from mlflow import MlflowClient
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.tracking.store import resolve_store
-from deepracer_exp.tracking.tracking_file import read_tracked_run
+from deepracer_exp.tracking.tracking_file import begin_again, is_copy, read_tracked_run
 
 from .conftest import TrackerHere, begin, cover, points, runs_of, write_rows
 
@@ -146,6 +146,28 @@ def test_a_run_resumed_with_another_store_is_complete_there(store, mlflow, tmp_p
     tracker.finish("FINISHED")
     assert tracker.failure is None
     assert [run.info.run_id for run in runs_of(mlflow)] == [killed.run_id]
+
+
+def test_a_copy_of_a_run_is_another_run_of_the_store_with_all_rows(store, mlflow, tmp_path):
+    original = tmp_path / "race" / "run"
+    original.mkdir(parents=True)
+    tracker = TrackerHere(store)
+    begin(tracker, original, tags={"run_dir": str(original)})
+    write_rows(original, rows_until(10))
+    tracker.finish("FINISHED")
+    copy = shutil.copytree(original, original.with_name("copy"), symlinks=True)
+    assert (is_copy(original), is_copy(copy)) == (False, True)
+    begin_again(copy, copy)
+    assert not is_copy(copy)
+    own = reopened(store, copy)
+    write_rows(copy, rows_until(12)[10:])
+    own.finish("FINISHED")
+    assert own.failure is None
+    assert {run.info.run_id for run in runs_of(mlflow)} == {tracker.run_id, own.run_id}
+    assert points(mlflow, tracker.run_id) == logged_until(10)
+    assert points(mlflow, own.run_id) == logged_until(12)
+    whole = shutil.copytree(tmp_path / "race", tmp_path / "moved" / "race", symlinks=True)
+    assert not is_copy(whole / "run")
 
 
 def test_a_resumed_run_is_shown_as_running(store, mlflow, tmp_path, killed, wait_until):

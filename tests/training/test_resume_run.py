@@ -168,6 +168,28 @@ def test_a_copy_without_links_continues_as_the_run_itself(trained, cut, call):
         assert (run / "checkpoints" / label).is_symlink()
 
 
+@pytest.mark.parametrize("is_there", [True, False], ids=["beside its original", "alone"])
+def test_a_copied_run_gets_a_record_of_its_own_and_a_moved_one_keeps_it(cut, call, is_there):
+    original = cut()
+    tracked = {
+        "run_name": "1",
+        "experiment": "tiny",
+        "start_ms": 0,
+        "tags": {"run_dir": str(original.resolve())},
+    }
+    (original / "tracking.json").write_text(json.dumps(tracked))
+    (original / "mlflow.json").write_text(json.dumps({"run_id": "0" * 32}))
+    run = shutil.copytree(original, original.with_name("copy"), symlinks=True)
+    if not is_there:
+        shutil.rmtree(original)
+    ended = call("resume", run.name, "budget.iterations=6")
+    assert ended.code == 0, ended.stderr
+    assert (run / "mlflow.json").exists() is not is_there
+    wanted = run if is_there else original
+    assert read_object(run / "tracking.json")["tags"]["run_dir"] == str(wanted.resolve())
+    assert not is_there or read_object(original / "mlflow.json")["run_id"] == "0" * 32
+
+
 def test_after_a_corrupt_checkpoint_the_run_is_written_again_from_the_newest_intact_one(trained, cut, call):
     run = cut()
     with (run / "metrics.jsonl").open("a") as metrics:
