@@ -37,34 +37,25 @@ def lap_progress(ndist, start_ndist, previous):  # type: ignore[no-untyped-def]
 
 
 class Judged(NamedTuple):
-    """Inputs of the rules at a control step, of one car or in arrays with a row per car; see `EpisodeRules.apply`."""
+    """Inputs of the rules for one car at a control step."""
 
     steps: Any
+    """The prepare step is 1."""
     progress: Any
+    """Per cent of the lap, and that at the step before."""
     last_progress: Any
     moved_m: Any
+    """Distance since the step before."""
     off_track: Any
-
-
-@compiled
-def judge_cars(judged, still, falling, rules, status):  # type: ignore[no-untyped-def]
-    """Write every car's status code and counters; see `EpisodeRules.apply`."""
-    for car in range(len(status)):
-        of_car = Judged(
-            judged.steps[car],
-            judged.progress[car],
-            judged.last_progress[car],
-            judged.moved_m[car],
-            judged.off_track[car],
-        )
-        status[car], still[car], falling[car] = judge_car(of_car, still[car], falling[car], rules)
+    """Whether no wheel is on the road."""
 
 
 @compiled
 def judge_car(judged, still, falling, rules):  # type: ignore[no-untyped-def]
     """Return a car's status code, and for how many steps it has now stood and driven backwards.
 
-    `judged` is of one car; `rules` are the limits of `EpisodeRules` and the codes of `rules`.
+    The rules are those of deepracer-simapp (markov/reset/rules and rollout_agent_ctrl.py). Where several hold, the
+    service's priority decides: time_up, lap_complete, the others. `rules` are the limits and the codes of `Rules`.
     """
     limits, codes = rules
     max_steps, immobilized_steps, immobilized_m, reversed_steps = limits
@@ -173,7 +164,7 @@ class Rules(NamedTuple):
     """The rules of a race."""
 
     limits: tuple[int, int, float, int]
-    """Limits of `EpisodeRules`."""
+    """`max_steps`, `immobilized_steps`, `immobilized_m` and `reversed_steps` of `EpisodeConfig`."""
     codes: tuple[int, ...]
     """Codes of `rules`, which also has `endings`."""
     endings: tuple[int, ...]

@@ -7,20 +7,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from deepracer_exp.config.driving import EpisodeConfig
 from deepracer_exp.rewards.params import TrackParams
 from deepracer_exp.sim.batch import CarState
 from deepracer_exp.tracks.track import Pose, Tracks
 
 from .rule_passes import (
     Episodes,
-    Judged,
     Places,
     Rules,
     Starts,
     begin_episodes,
     endings_of,
-    judge_cars,
     step_cars,
     wheels_of_cars,
 )
@@ -66,60 +63,6 @@ def lap_clock_s(steps: ArrayLike, period_s: float) -> Floats:
     return np.asarray(steps, np.float64) * period_s
 
 
-class EpisodeRules:
-    """The rules that end an episode, for N cars (deepracer-simapp, markov/reset/rules and rollout_agent_ctrl.py).
-
-    A car's first step is the prepare step: it stands at its start pose and no rule is applied.
-    """
-
-    def __init__(self, config: EpisodeConfig, n_cars: int):
-        self.limits = (
-            config.max_steps,
-            config.immobilized_steps,
-            float(config.immobilized_m),
-            config.reversed_steps,
-        )
-        self._still = np.zeros(n_cars, np.int64)
-        self._falling = np.zeros(n_cars, np.int64)
-
-    @property
-    def counters(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """For how many steps the cars have stood, and for how many they have driven backwards, (N,) each."""
-        return self._still, self._falling
-
-    def reset(self, ids: np.ndarray) -> None:
-        """Set the counters of the cars `ids` to zero."""
-        self._still[ids] = 0
-        self._falling[ids] = 0
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return copies of the counters."""
-        return {"still": self._still.copy(), "falling": self._falling.copy()}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore the counters of a `state_dict`."""
-        self._still[:] = checked_array(state, "still", self._still.shape)
-        self._falling[:] = checked_array(state, "falling", self._falling.shape)
-
-    def apply(
-        self,
-        steps: np.ndarray,
-        progress: np.ndarray,
-        last_progress: np.ndarray,
-        moved_m: np.ndarray,
-        off_track: np.ndarray,
-    ) -> np.ndarray:
-        """Return each car's status code, (N,) int64, for its control steps and its progress in per cent.
-
-        The prepare step is step 1; `moved_m` is the distance since the step before, and `off_track` means that no wheel
-        is on the road. Where several rules hold, the service's priority decides: time_up, lap_complete, the others.
-        """
-        status = np.empty(len(steps), np.int64)
-        judged = Judged(steps, progress, last_progress, moved_m, off_track)
-        judge_cars(judged, *self.counters, (self.limits, _CODES), status)
-        return status
-
-
 @dataclass(frozen=True, eq=False)
 class StepResult:
     """The result of one control step; arrays with one row per car."""
@@ -146,7 +89,8 @@ class StepResult:
 class RaceRules:
     """Applies the rules to the poses of N cars step by step, from physics, a recording or any caller.
 
-    A step is one call of `measure` and one of `apply`. The first step of an episode is the prepare step.
+    A step is one call of `measure` and one of `apply`. The first step of an episode is the prepare step, in which the
+    car stands at its start pose and nothing ends the episode.
 
     Attributes:
         now: the poses last measured.
@@ -175,7 +119,6 @@ class RaceRules:
         self._driven = np.zeros((n_cars, len(turns)), np.int64)
         self._period_s = setup.car.control_period_s
         self._front_point_m = setup.car.front_point_m
-        self._episode_rules = EpisodeRules(setup.episode, n_cars)
         self._everyone = np.arange(n_cars)
         self.now: Measures
         self.episode = np.full(n_cars, -1)
@@ -185,6 +128,8 @@ class RaceRules:
         self._previous = np.zeros(n_cars)
         self._last_progress = np.zeros(n_cars)
         self._last_front = np.zeros((n_cars, 2))
+        self._still = np.zeros(n_cars, np.int64)
+        self._falling = np.zeros(n_cars, np.int64)
         self.episodes = Episodes(
             self.cars,
             self.course,
@@ -197,14 +142,21 @@ class RaceRules:
             self._previous,
             self._last_progress,
             self._last_front,
-            *self._episode_rules.counters,
+            self._still,
+            self._falling,
         )
-        self._starts = Starts(setup.episode.start_offset, setup.episode.start_advance, first_track, turns)
+        episode = setup.episode
+        self._starts = Starts(episode.start_offset, episode.start_advance, first_track, turns)
         self._rules = Rules(
-            self._episode_rules.limits,
+            (
+                episode.max_steps,
+                episode.immobilized_steps,
+                float(episode.immobilized_m),
+                episode.reversed_steps,
+            ),
             _CODES,
             _ENDINGS,
-            setup.episode.lap_terminates,
+            episode.lap_terminates,
             np.array(setup.car.wheel_points_m, np.float64),
         )
 
@@ -246,7 +198,7 @@ class RaceRules:
         """
         self._previous[ids] = percent
         self._last_progress[ids] = percent
-        self._episode_rules.reset(ids)
+        self.rest(ids)
         return self.tracks.start_pose(self.start_ndist[ids] + percent / 100.0, self.track_index[ids])
 
     def start_midway(self, steps: np.ndarray, progress: np.ndarray) -> None:
@@ -262,7 +214,8 @@ class RaceRules:
         same last bit for an array of another length.
         """
         kept = {key: getattr(self, name).copy() for name, key in _KEPT.items()}
-        return {**kept, "rules": self._episode_rules.state_dict(), "now": self.now.state_dict()}
+        counters = {"still": self._still.copy(), "falling": self._falling.copy()}
+        return {**kept, "rules": counters, "now": self.now.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore a `state_dict`.
@@ -273,7 +226,8 @@ class RaceRules:
         for name, key in _KEPT.items():
             array = getattr(self, name)
             array[:] = checked_array(state, key, array.shape)
-        self._episode_rules.load_state_dict(state["rules"])
+        self._still[:] = checked_array(state["rules"], "still", self._still.shape)
+        self._falling[:] = checked_array(state["rules"], "falling", self._falling.shape)
         self.now = Measures.from_state_dict(state["now"], self.n_cars)
 
     def measure(self, cars: CarState) -> Measures:
@@ -302,7 +256,8 @@ class RaceRules:
 
     def rest(self, ids: Ids) -> None:
         """Forget how long the cars `ids` have stood or driven backwards."""
-        self._episode_rules.reset(ids)
+        self._still[ids] = 0
+        self._falling[ids] = 0
 
     def params(
         self, result: StepResult, steering_deg: np.ndarray, speed_mps: np.ndarray

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from deepracer_exp.env.race import Race
-from deepracer_exp.env.rules import EpisodeRules
+from deepracer_exp.env.rules import RaceRules
 from deepracer_exp.env.trace_columns import STATUS_CODE
+from deepracer_exp.sim.batch import CarState
 from tests.conftest import refused
 from tests.env.conftest import make_setup
 
@@ -113,18 +114,20 @@ def test_a_state_of_another_race_is_refused(everything, overrides, options, what
 
 
 def test_a_car_that_was_reversed_for_ten_steps_ends_its_episode_after_five_more():
-    config = make_setup().episode
-    assert config.reversed_steps == 15
-    at = np.zeros(1)
+    setup = make_setup()
+    assert setup.episode.reversed_steps == 15
+    before, after = RaceRules(setup, 1), RaceRules(setup, 1)
 
-    def apply(rules: EpisodeRules, step: int) -> int:
-        return int(rules.apply(at + step, 50.0 - at - step, 51.0 - at - step, at + 1.0, at > 0)[0])
+    def fall_back(rules: RaceRules, step: int) -> int:
+        pose = rules.tracks.start_pose(np.array([0.5 - 0.001 * step]), rules.track_index)
+        rules.measure(CarState(*pose, *np.zeros((4, 1))))
+        return int(rules.apply().status[0])
 
-    before, after = EpisodeRules(config, 1), EpisodeRules(config, 1)
-    for step in range(2, 12):
-        apply(before, step)
+    before.reset()
+    for step in range(11):  # the prepare step, and ten
+        fall_back(before, step)
     after.load_state_dict(before.state_dict())
-    verdicts = [apply(after, step) for step in range(12, 17)]
+    verdicts = [fall_back(after, step) for step in range(11, 16)]
     assert verdicts == [STATUS_CODE["in_progress"]] * 4 + [STATUS_CODE["reversed"]]
 
 

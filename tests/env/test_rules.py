@@ -6,8 +6,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepracer_exp.config.driving import EpisodeConfig
-from deepracer_exp.env.rules import EpisodeRules
-from deepracer_exp.env.trace_columns import EPISODE_STATUS
+from deepracer_exp.env.rule_passes import Judged, judge_car
+from deepracer_exp.env.rules import RaceRules
+from deepracer_exp.env.trace_columns import EPISODE_STATUS, STATUS_CODE
+from deepracer_exp.sim.batch import CarState
+
+from .conftest import make_setup
 
 CONFIG = EpisodeConfig(
     start_offset=0.0,
@@ -19,12 +23,29 @@ CONFIG = EpisodeConfig(
 )
 
 
+CODES = tuple(
+    STATUS_CODE[status]
+    for status in (
+        "prepare",
+        "in_progress",
+        "reversed",
+        "immobilized",
+        "off_track",
+        "lap_complete",
+        "time_up",
+    )
+)
+
+
 class OneCar:
     """Judges one car step by step; a step that does not say otherwise moves forward on the road."""
 
     def __init__(self, **changes: float):
-        self.rules = EpisodeRules(dataclasses.replace(CONFIG, **changes), 1)
+        config = dataclasses.replace(CONFIG, **changes)
+        limits = config.max_steps, config.immobilized_steps, config.immobilized_m, config.reversed_steps
+        self.rules = limits, CODES
         self.steps, self.progress = 0, 10.0
+        self.counters = 0, 0
 
     def step(
         self,
@@ -36,10 +57,9 @@ class OneCar:
         self.steps += 1
         before = self.progress
         self.progress = before + ahead if progress is None else progress
-        status = self.rules.apply(
-            *(np.array([value]) for value in (self.steps, self.progress, before, moved_m, off_track))
-        )
-        return EPISODE_STATUS[status[0]]
+        judged = Judged(self.steps, self.progress, before, float(moved_m), off_track)
+        status, *self.counters = judge_car(judged, *self.counters, self.rules)
+        return EPISODE_STATUS[status]
 
     def steps_until(self, status: str, most: int, **how: float) -> int | None:
         for count in range(1, most + 1):
@@ -118,18 +138,16 @@ def test_time_comes_before_the_lap_and_the_lap_before_the_rest(complete, off_tra
 
 
 def test_a_new_episode_counts_from_zero_and_leaves_the_other_cars_alone():
-    rules = EpisodeRules(CONFIG, 3)
+    setup = make_setup()
+    assert setup.episode.immobilized_steps == 15
+    rules = RaceRules(setup, 3)
+    rules.measure(CarState(*rules.reset(start_ndist=np.full(3, 0.5)), *np.zeros((4, 3))))
 
-    def stand(steps: int) -> np.ndarray:
-        for step in range(steps):
-            progress = np.full(3, 50.0 - 0.1 * step)
-            status = rules.apply(
-                np.full(3, 10 + step), progress, progress + 0.1, np.zeros(3), np.zeros(3, bool)
-            )
-        return status
+    def stand(steps: int) -> list[str]:
+        for _ in range(steps):
+            status = rules.apply().status
+        return [EPISODE_STATUS[code] for code in status]
 
-    stand(10)
-    rules.reset(np.array([1]))
-    np.testing.assert_array_equal(
-        [EPISODE_STATUS[code] for code in stand(5)], ["immobilized", "in_progress", "immobilized"]
-    )
+    assert stand(11) == ["in_progress"] * 3
+    rules.reset(np.array([1]), np.array([0.5]))
+    assert stand(5) == ["immobilized", "in_progress", "immobilized"]
