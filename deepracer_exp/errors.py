@@ -77,6 +77,15 @@ def reading(what: object, accepted: str = "", why: str = "") -> Iterator[None]:
 
 
 @contextmanager
+def naming(what: object) -> Iterator[None]:
+    """Put the key or file in front of the line of `BadInput`."""
+    try:
+        yield
+    except BadInput as error:
+        raise BadInput(what, error) from None
+
+
+@contextmanager
 def writing(
     what: object, accepted: str = "", failure: type[Exception] = BadInput, also: type[Exception] = OSError
 ) -> Iterator[None]:

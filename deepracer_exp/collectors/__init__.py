@@ -1,5 +1,5 @@
 """Batches of control steps from cars in this process or in several.
 
-`collector.open_collector` gives a `Collector`; `forking.start_workers_early` starts its processes while a
+`collector.Collector` starts the cars; `forking.start_workers_early` starts its processes while a
 command imports.
 """

@@ -59,9 +59,21 @@ class Collector:
         state: Mapping[str, Any] | None = None,
         rivals: Rivals | None = None,
     ):
-        """Start the cars; arguments and errors as for `open_collector`.
+        """Start the cars in this process or in workers, as configured.
 
-        `frames_per_batch` is in control steps over all cars, and is rounded up to whole steps of all cars.
+        Args:
+            config: the collector's group.
+            setup: the race.
+            policy: reads its keys of a `RaceEnv`, writes `action` and its log-probability.
+            frames_per_batch: control steps over all cars, rounded up to whole steps of all cars.
+            run_dir: where workers leave crash dumps and prints.
+            state: `state_dict` of a collector of the same configuration and setup: with the same weights, the next
+                batch equals that of the original collector, bit for bit. None or empty: new episodes begin.
+            rivals: of the cars; None: they are alone.
+
+        Raises:
+            BadInput: the state is of other cars, or of another number of processes.
+            RunFailed: a worker did not start.
         """
         if state and config.forks and config.processes is None:
             # Of a run that continues on a machine with another number of cores.
@@ -77,7 +89,7 @@ class Collector:
         self._states: list[Any] = []
         states = states_of(self._begun_from, max(1, self._workers))
         self._watchdog: Watchdog | None = None
-        cars = cars_per_process(config)
+        cars = config.cars // max(1, self._workers)
         factory = functools.partial(EnvFactory, setup=setup, n_cars=cars, run_dir=run_dir, rivals=rivals)
         options: dict[str, Any] = {
             "frames_per_batch": self._steps * config.cars,
@@ -354,35 +366,6 @@ def _in_background(question: Callable[[], _T]) -> Future[_T]:
     return answer
 
 
-def open_collector(
-    config: CollectorConfig,
-    algorithm: AlgorithmConfig,
-    setup: RaceSetup,
-    policy: torch.nn.Module,
-    run_dir: Path,
-    state: Mapping[str, Any] | None = None,
-    rivals: Rivals | None = None,
-) -> Collector:
-    """Start the cars in this process or in workers, as configured.
-
-    Args:
-        config: the collector's group.
-        algorithm: says how many frames or episodes an iteration has.
-        setup: the race.
-        policy: reads its keys of a `RaceEnv`, writes `action` and its log-probability.
-        run_dir: where workers leave crash dumps and prints.
-        state: `state_dict` of a collector of the same configuration and setup: with the same weights, the next batch
-            equals that of the original collector, bit for bit. None or empty: new episodes begin.
-        rivals: of the cars; None: they are alone.
-
-    Raises:
-        BadInput: the state is of other cars, or of another number of processes.
-        RunFailed: a worker did not start.
-    """
-    frames = frames_per_batch(config, algorithm)
-    return Collector(config, setup, policy, frames, run_dir, state, rivals)
-
-
 def frames_per_batch(config: CollectorConfig, algorithm: AlgorithmConfig) -> int:
     """Return the control steps of a batch, over all cars."""
     frames = algorithm.frames_per_iteration
@@ -399,11 +382,6 @@ def worker_count(config: CollectorConfig) -> int:
 def steps_per_batch(config: CollectorConfig, frames: int) -> int:
     """Return the steps of each car in a batch of this many frames over all cars, rounded up."""
     return -(-frames // config.cars)
-
-
-def cars_per_process(config: CollectorConfig) -> int:
-    """Return the number of cars in each process."""
-    return config.cars // max(1, worker_count(config))
 
 
 def by_worker(states: Iterable[Any]) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from deepracer_exp.aws.models.model_metadata import NEURAL_NETWORKS, ModelMetadata
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import naming
 
 from .car import CarConfig
 from .compose import compose_experiment, compose_option
@@ -25,10 +25,8 @@ def tracks_of(experiment: Experiment, config: EvaluationConfig) -> dict[str, Tra
     if config.tracks is None:
         return experiment.tracks
     names = config.tracks if isinstance(config.tracks, str) else list(config.tracks)
-    try:
+    with naming("evaluation.tracks"):
         return compose_experiment([override_line("track", names)])[0].tracks
-    except BadInput as error:
-        raise BadInput("evaluation.tracks", error) from None
 
 
 def conditions_of(experiment: Experiment, config: EvaluationConfig, key: str) -> RandomizationConfig:
@@ -39,10 +37,8 @@ def conditions_of(experiment: Experiment, config: EvaluationConfig, key: str) ->
     """
     if (option := getattr(config, key)) is None:
         return experiment.randomization
-    try:
+    with naming(f"evaluation.{key}"):
         return compose_option("randomization", option, RandomizationConfig)
-    except BadInput as error:
-        raise BadInput(f"evaluation.{key}", error) from None
 
 
 def race_of(experiment: Experiment, config: EvaluationConfig) -> RaceConfig:
@@ -53,10 +49,8 @@ def race_of(experiment: Experiment, config: EvaluationConfig) -> RaceConfig:
     """
     if config.race is None:
         return experiment.race
-    try:
+    with naming("evaluation.race"):
         return compose_option("race", config.race, RaceConfig)
-    except BadInput as error:
-        raise BadInput("evaluation.race", error) from None
 
 
 def no_randomization() -> RandomizationConfig:

@@ -27,22 +27,25 @@ It is in per cent of the lap; at an episode's first rewarded step, it is the pro
 """
 
 
-OBJECT_COLUMNS = (
-    "is_crashed",
-    "closest_objects",
-    "objects_location",
-    "objects_left_of_center",
-    "object_in_camera",
-    "objects_speed",
-    "objects_heading",
-    "objects_distance_from_center",
-    "objects_distance",
-)
-"""The keys about boxes and bots, one row per car: of K others (N, K), `objects_location` (N, K, 2); `is_crashed` and
-`object_in_camera` (N,), `closest_objects` (N, 2). Columns have them only where there are others."""
 MASK = "objects_mask"
 """The extra key of `reward_batch`: the mask of the filled entries in the arrays about others, (N, K); those of a car
 come first."""
+_ALONE: dict[str, tuple[tuple[int, ...], type]] = {
+    "is_crashed": ((), np.bool_),
+    "closest_objects": ((2,), np.int64),
+    "objects_location": ((0, 2), np.float64),
+    "objects_left_of_center": ((0,), np.bool_),
+    "object_in_camera": ((), np.bool_),
+    "objects_speed": ((0,), np.float64),
+    "objects_heading": ((0,), np.float64),
+    "objects_distance_from_center": ((0,), np.float64),
+    "objects_distance": ((0,), np.float64),
+    MASK: ((0,), np.bool_),
+}
+"""Shape for each car and type of the columns about others where a car is alone."""
+OBJECT_COLUMNS = tuple(_ALONE)[:-1]
+"""The keys about boxes and bots, one row per car: of K others (N, K), `objects_location` (N, K, 2); `is_crashed` and
+`object_in_camera` (N,), `closest_objects` (N, 2). Columns have them only where there are others."""
 
 
 class TrackParams(NamedTuple):
@@ -135,18 +138,3 @@ def batch_params(
         if key not in params:
             params[key] = np.zeros((n, *shape), dtype)
     return params
-
-
-_ALONE: dict[str, tuple[tuple[int, ...], type]] = {
-    "is_crashed": ((), np.bool_),
-    "closest_objects": ((2,), np.int64),
-    "objects_location": ((0, 2), np.float64),
-    "objects_left_of_center": ((0,), np.bool_),
-    "object_in_camera": ((), np.bool_),
-    "objects_speed": ((0,), np.float64),
-    "objects_heading": ((0,), np.float64),
-    "objects_distance_from_center": ((0,), np.float64),
-    "objects_distance": ((0,), np.float64),
-    MASK: ((0,), np.bool_),
-}
-"""Shape for each car and type of the columns about others where a car is alone."""

@@ -16,7 +16,7 @@ from deepracer_exp.errors import BadInput, RunFailed
 from .params import TrackParams, batch_params, row_keys, rows, scalar_params, select
 from .prints import RewardPrints
 from .source import RewardSource, source_with_constants
-from .time_limit import TimeLimit, TimeLimitPassed, run_module
+from .time_limit import TimeLimit, TimeLimitPassed, run_module, what_was_raised
 
 Value = TypeVar("Value")
 
@@ -279,15 +279,8 @@ def what_happened(error: BaseException, path: str) -> str:
     """Describe an error of the code of module `path` in one line with its place."""
     if isinstance(error, Unusable):
         return str(error)
-    line, trace = 0, error.__traceback__
-    while trace is not None:
-        if trace.tb_frame.f_code.co_filename == path:
-            line = trace.tb_lineno
-        trace = trace.tb_next
-    message = _one_line(str(error))
-    if not isinstance(error, TimeLimitPassed):
-        message = f"raised {type(error).__name__}{': ' + message if message else ''}"
-    return f"{message} in line {line} of {path}" if line else message
+    raised = what_was_raised(error, path)
+    return raised.removeprefix("raised TimeLimitPassed: ") if isinstance(error, TimeLimitPassed) else raised
 
 
 def _as_reward(value: object) -> float:

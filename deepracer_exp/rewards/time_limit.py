@@ -1,8 +1,9 @@
-"""Execution of reward code: its module, and a time limit for blocks of it."""
+"""Execution of reward code: its module, a time limit for blocks of it, and its errors in words."""
 
 import signal
 import threading
 import time
+import traceback
 from types import CodeType, FrameType
 from typing import Any, Self
 
@@ -17,6 +18,19 @@ _WAITS = 0.01
 def run_module(code: CodeType, namespace: dict[str, Any]) -> None:
     """Run the compiled module of a reward function in a namespace; only here a text is executed as a program."""
     exec(code, namespace)
+
+
+def what_was_raised(error: BaseException, path: str) -> str:
+    """Describe an error of the code of the file `path` in one line with its place."""
+    lines = [
+        line for frame, line in traceback.walk_tb(error.__traceback__) if frame.f_code.co_filename == path
+    ]
+    place = f" in line {lines[-1]} of {path}" if lines else ""
+    try:
+        message = " ".join(str(error).split())
+    except BaseException:  # noqa: BLE001 - of the error's own code
+        return f"raised an error that cannot be printed{place}"
+    return f"raised {type(error).__name__}{': ' * bool(message)}{message[:300]}{place}"
 
 
 class TimeLimitPassed(BaseException):

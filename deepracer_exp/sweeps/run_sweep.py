@@ -25,7 +25,7 @@ from deepracer_exp.config.stored import with_overrides
 from deepracer_exp.config.sweep import SweepConfig, SweepRequest
 from deepracer_exp.env.real_car import require_car
 from deepracer_exp.env.setup import build_setup
-from deepracer_exp.errors import BadInput, count
+from deepracer_exp.errors import BadInput, count, naming
 from deepracer_exp.rewards.reward import RewardFunction
 from deepracer_exp.runs.lineage import refuse_other_networks
 from deepracer_exp.sweeps.queue.study import enqueue, known_settings
@@ -152,7 +152,7 @@ def check_clone(trial: TrainPlan, config: SweepConfig, stored: bool) -> None:
     """
     if config.clone is None:
         return
-    try:
+    with naming("sweep.clone"):
         mapping = copy.deepcopy(trial.composition.mapping)
         changed = with_overrides(mapping, {}, config.clone_overrides, stored=stored)
         clone = parse_experiment(changed.mapping)
@@ -163,8 +163,6 @@ def check_clone(trial: TrainPlan, config: SweepConfig, stored: bool) -> None:
                 )
         plan_training(clone, changed)
         refuse_other_networks(trial.experiment, clone)
-    except BadInput as error:
-        raise BadInput("sweep.clone", error) from error
 
 
 def begin_study_run(

@@ -1,7 +1,6 @@
 """Courses: centre line, borders, and positions relative to them; one course, or several as one batch."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
@@ -15,7 +14,7 @@ from shapely.geometry.base import BaseGeometry
 from deepracer_exp.aws.worlds.catalogue import find_world, worlds
 from deepracer_exp.aws.worlds.routes import checked_rows, read_knots, read_route, rows_from_knots, world_rows
 from deepracer_exp.config.driving import FloorConfig, TrackConfig
-from deepracer_exp.errors import BadInput
+from deepracer_exp.errors import BadInput, naming
 
 from . import segments
 from .segments import Bands, Segments, build_bands, build_segments
@@ -169,11 +168,11 @@ class Track:
         elif path.suffix in (".yaml", ".yml"):
             course = read_knots(path)
             title = course.title
-            with _naming(path):
+            with naming(path):
                 rows = rows_from_knots(course.knots, course.width_m, course.closed)
         else:
             raise BadInput(path, f"ending {path.suffix!r}", ".npy (route) and .yaml (knots)")
-        with _naming(path):
+        with naming(path):
             return cls.from_route(rows, path.stem, title=title, reversed=reversed, floor=floor)
 
     @classmethod
@@ -187,9 +186,9 @@ class Track:
         """
         backwards = config.direction == "reversed" if reversed is None else reversed
         if config.file is not None:
-            with _naming("track.file"):
+            with naming("track.file"):
                 return cls.from_file(Path(config.file), backwards, config.floor)
-        with _naming(f"track {config.name}"):
+        with naming(f"track {config.name}"):
             if config.knots is None or config.width_m is None:
                 rows = world_rows(config.name)
             else:
@@ -329,15 +328,6 @@ def _points(points: np.ndarray) -> np.ndarray:
     if points.ndim != 2 or points.shape[1] != 2:
         raise ValueError(f"points have shape {points.shape}, not (n, 2)")
     return points
-
-
-@contextmanager
-def _naming(source: object) -> Iterator[None]:
-    """Prefix the messages of `BadInput` with their source."""
-    try:
-        yield
-    except BadInput as error:
-        raise BadInput(source, error) from None
 
 
 def directed_tracks(config: TrackConfig) -> tuple[Track, ...]:

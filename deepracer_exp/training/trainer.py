@@ -18,7 +18,7 @@ from tensordict import TensorDictBase
 
 from deepracer_exp.agents.algorithm import UpdateMetrics
 from deepracer_exp.agents.build import build_agent, build_networks
-from deepracer_exp.collectors.collector import Collector, open_collector
+from deepracer_exp.collectors.collector import Collector, frames_per_batch
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.env.others.placement import placements_table
@@ -439,11 +439,11 @@ class Trainer:
         if self.rivals is not None and not self.iteration:
             self.rivals.take(0)
         return self.running.enter_context(
-            open_collector(
+            Collector(
                 experiment.collector,
-                experiment.algorithm,
                 self.setup,
                 self.networks.policy,
+                frames_per_batch(experiment.collector, experiment.algorithm),
                 self.folder.path,
                 self._cars,
                 None if self.rivals is None else self.rivals.rivals,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, TypeAdapter
 
-from deepracer_exp.errors import BadInput, nearest, reading
+from deepracer_exp.errors import BadInput, naming, nearest, reading
 from deepracer_exp.files import ROUTE_BYTES, open_user_file, read_yaml_as
 
 from .catalogue import FILE, ROUTES, UNITS_PER_M, worlds
@@ -67,10 +67,8 @@ def read_route(path: str | Path) -> np.ndarray:
         rows = np.lib.format.read_array(file, allow_pickle=False)
     if rows.dtype.kind not in "fiu":
         raise BadInput(path, f"holds {rows.dtype.name} values; accepted are {ROUTE_ROWS}")
-    try:
+    with naming(path):
         return checked_rows(rows)
-    except BadInput as error:
-        raise BadInput(path, error) from None
 
 
 def checked_rows(rows: np.ndarray) -> np.ndarray:

@@ -9,13 +9,12 @@ import os
 import reprlib
 import signal
 import sys
-import traceback
 from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
-from deepracer_exp.rewards.time_limit import run_module
+from deepracer_exp.rewards.time_limit import run_module, what_was_raised
 
 from .coverage import Coverage
 
@@ -74,7 +73,7 @@ class _Module:
                 else f"reward_function is {reprlib.repr(function)}, no function"
             )
         except BaseException as error:  # noqa: BLE001 - of the module's code
-            return f"cannot be imported: {_what_happened(error, self._path)}"
+            return f"cannot be imported: {what_was_raised(error, self._path)}"
 
     def signature(self) -> str | None:
         """Return the function's parameters unless there is exactly one."""
@@ -96,7 +95,7 @@ class _Module:
             accepted = f"a float from {-self._most:g} to {self._most:g}"
             return f"line {coverage.returned_at} {returned}; accepted: {accepted}"
         except BaseException as error:  # noqa: BLE001 - of the module's code
-            return _what_happened(error, self._path)
+            return what_was_raised(error, self._path)
 
     def executed_lines(self, params: dict[str, Any]) -> list[int]:
         """Return the lines that a call executes, after the module is run."""
@@ -122,19 +121,6 @@ def _as_in_python(params: dict[str, Any]) -> dict[str, Any]:
     """Return params from JSON with NumPy's types where the validator has them."""
     numbers = {name: np.float64(params[name]) for name in ("x", "y")}
     return params | numbers | {"waypoints": np.array(params["waypoints"])}
-
-
-def _what_happened(error: BaseException, path: str) -> str:
-    """Describe an error of the code of the file `path` in one line with its place."""
-    lines = [
-        line for frame, line in traceback.walk_tb(error.__traceback__) if frame.f_code.co_filename == path
-    ]
-    place = f" in line {lines[-1]} of {path}" if lines else ""
-    try:
-        message = " ".join(str(error).split())
-    except BaseException:  # noqa: BLE001 - of the error's own code
-        return f"raised an error that cannot be printed{place}"
-    return f"raised {type(error).__name__}{': ' * bool(message)}{message[:300]}{place}"
 
 
 def _format(*values: object, **_: object) -> None:
