@@ -49,6 +49,14 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
+# What an account's or a job's terminal can do decides how commands write: without it they write alike everywhere.
+for _variable in ("TERM", "COLUMNS", "LINES", "NO_COLOR", "FORCE_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE"):
+    os.environ.pop(_variable, None)
+
+# A proxy for the world outside answers in place of servers that tests start or that are not there.
+for _variable in ("NO_PROXY", "no_proxy"):
+    os.environ[_variable] = ",".join(filter(None, (os.environ.get(_variable), "127.0.0.1,localhost")))
+
 # A job that a script starts in the background ignores Ctrl-C, and so would the processes that the tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 

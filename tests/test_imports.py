@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import multiprocessing
+import os
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -126,4 +127,5 @@ assert users.doubled(2.0) == 4.0
     forked.start()
     forked.join()
     assert forked.exitcode == 0
-    assert list((tmp_path / "__pycache__").glob("users.doubled-*.nbi"))
+    kept = Path(os.environ.get("NUMBA_CACHE_DIR") or tmp_path / "__pycache__")
+    assert list(kept.rglob("users.doubled-*.nbi"))

@@ -45,11 +45,12 @@ VALUES = {"factor": 0.5, "friction": 1.0, "shares": (1.0, 1.0), "limits": [9.0]}
 def driven(package: Path, **variables: str) -> tuple[float, int]:
     """Drive in a new process and return the speed, and how many signatures were taken from the disk."""
     code = "from deepracer_exp.sim.mujoco_model import drive; print(drive(8.0), sum(drive.stats.cache_hits.values()))"
+    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
     made = subprocess.run(
         # Without bytecode: one of a file of the same second and size would be taken for the changed file's.
         [sys.executable, "-B", "-c", code],
         cwd=package.parent,
-        env=os.environ | {"XDG_CACHE_HOME": str(package.parent / "cache")} | variables,
+        env=environment | {"XDG_CACHE_HOME": str(package.parent / "cache")} | variables,
         check=True,
         capture_output=True,
         text=True,

@@ -107,7 +107,7 @@ def test_a_thread_that_computes_is_waited_for_by_its_cpu():
     idle_s, computed_s = waited("""
 over = threading.Event()
 threading.Thread(target=lambda: all(not over.is_set() for _ in iter(int, 1)), daemon=True).start()
-silence = wait_patiently(lambda seconds: over.wait(seconds), 0.4)
+silence = wait_patiently(lambda seconds: over.wait(seconds), 2.0)
 over.set()
 print(silence.idle_s, silence.computed_s)
 """)

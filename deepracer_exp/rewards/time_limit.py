@@ -60,11 +60,11 @@ class TimeLimit:
 
     def __enter__(self) -> Self:
         if self._holds:
-            self._began_s = time.monotonic()
             self._cpu_began_s = self._cpu_s = time.thread_time()
             self._handler = signal.signal(signal.SIGALRM, self._check)
             every_s = self._limit_s / _LOOKS
             self._timer = signal.setitimer(signal.ITIMER_REAL, every_s, every_s)
+            self._began_s = time.monotonic()
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -88,7 +88,8 @@ for number in range(done + 1, 11):
     aside.unlink(missing_ok=True)
     aside.symlink_to(f"{number:06d}")
     aside.replace(run / "checkpoints" / "last")
-(run / "summary.json").write_text('{"status": "finished"}')
+(run / ".summary").write_text('{"status": "finished"}')
+(run / ".summary").replace(run / "summary.json")
 """
 """Counts to ten, and continues where it was killed."""
 

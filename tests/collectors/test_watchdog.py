@@ -60,6 +60,7 @@ def test_a_worker_without_a_step_is_ended_and_the_other_lives(watch, beats, proc
     counters[:] = 1
     dog.expect(10)
     _keep_beating(counters, [1], dog)
+    dog.rest()  # nobody makes the other's steps any more
     assert list(dog.verdict) == [0]
     assert "after 1 steps" in dog.verdict[0]
     assert "collector.hang_timeout_s=2" in dog.verdict[0]
@@ -71,6 +72,7 @@ def test_a_worker_without_a_step_is_ended_and_the_other_lives(watch, beats, proc
 
 def test_a_worker_that_has_driven_its_part_may_rest(watch, beats):
     dog = watch()
+    dog.rest()
     beats()[:] = 10, 9
     dog.expect(10)
     wait_until(lambda: dog.verdict)

@@ -3,6 +3,7 @@
 import re
 import shutil
 import webbrowser
+from functools import partialmethod
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from deepracer_exp.reports.pages import log_report
 from deepracer_exp.runs import recording as run_recording
 from tests.aws.made_up_logs import drives, log_text
 from tests.page_html import Html
+from tests.waiting import PATIENCE_S
 
 QUICK = (
     "budget.iterations=1",
@@ -173,10 +175,14 @@ def test_bad_input_is_one_line(run_dir, call, tmp_path, arguments, words):
 
 
 @pytest.mark.processes
-def test_a_training_ends_with_its_page_which_stands_in_its_mlflow_run_too(call):
+def test_a_training_ends_with_its_page_which_stands_in_its_mlflow_run_too(call, monkeypatch):
     from mlflow import MlflowClient
 
     from deepracer_exp.runs.run_files import read_run_id
+    from deepracer_exp.tracking.tracker import ProjectedTracker
+
+    patient = partialmethod(ProjectedTracker.finish, deadline_s=PATIENCE_S)
+    monkeypatch.setattr(ProjectedTracker, "finish", patient)
 
     tiny = ("experiment=tiny", "collector=in_process", "collector.threads=1", *QUICK)
     ended = call("train", *tiny, "report=true")

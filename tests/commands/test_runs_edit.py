@@ -84,7 +84,7 @@ def test_conditions_and_an_order_hold_of_what_is_listed_in_every_format(season, 
     ]
     assert [
         row["exploring_laps"]
-        for row in listed(call, "--where", "began>=2026-11-04T00", "--where", "exploring_laps!=3")
+        for row in listed(call, "--where", "began>=2026-11-04T12", "--where", "exploring_laps!=3")
     ] == [2]
     assert listed(call, "--where", "run~NOTHING") == []
     table = call("runs", "list", "--where", "state=finished", "--format", "csv").stdout

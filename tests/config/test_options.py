@@ -1,3 +1,5 @@
+import os
+
 import pytest
 
 from deepracer_exp.config.compose import compose_experiment
@@ -30,8 +32,9 @@ def test_an_option_is_composed_as_it_is_now(here, own, is_link):
     (here / "conf").mkdir()
     if is_link:
         (here / "conf" / "budget").symlink_to(here / "elsewhere")
-    for steps in (2001, 3002, 3002):  # of the same length
-        own("budget/mine.yaml", f"defaults: [default, _self_]\nenv_steps: {steps}\n")
+    for second, steps in ((1, 2001), (2, 3002), (3, 3002)):  # of the same length
+        file = own("budget/mine.yaml", f"defaults: [default, _self_]\nenv_steps: {steps}\n")
+        os.utime(file, (second, second))  # some file systems count whole seconds
         assert compose_experiment(["budget=mine"])[0].budget.env_steps == steps
         assert compose_experiment(["budget=mine", "budget.env_steps=7"])[0].budget.env_steps == 7
         assert compose_experiment(["budget=mine"])[0].budget.env_steps == steps

@@ -289,7 +289,12 @@ def test_the_button_beside_a_command_copies_it(sweep, tab):
     tab.call("Page.bringToFront")
     lines = tab.evaluate("[...document.querySelectorAll('.command code')].map(one => one.textContent)")
     assert any(line.startswith("deepracer-exp train ") for line in lines)
+    # The word stands for two seconds, which may all be between two looks.
+    tab.evaluate(
+        "for (const one of document.querySelectorAll('.command button')) new MutationObserver(() => one.said ="
+        " [...(one.said ?? []), one.textContent]).observe(one, {childList: true, characterData: true, subtree: true})"
+    )
     for at, line in enumerate(lines):
         tab.evaluate(f"document.querySelectorAll('.command button')[{at}].click()")
-        tab.wait_for(f"document.querySelectorAll('.command button')[{at}].textContent === 'Copied'")
+        tab.wait_for(f"document.querySelectorAll('.command button')[{at}].said?.includes('Copied')")
         assert tab.evaluate("navigator.clipboard.readText()") == line

@@ -9,6 +9,7 @@ import shutil
 import socket
 import struct
 import threading
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -42,6 +43,7 @@ from deepracer_exp.sim.scenery import wall_ring
 from deepracer_exp.tracks.track import Track
 from tests.browser import needs_chromium
 from tests.page_html import Html
+from tests.waiting import wait_until
 
 STEREO = CameraConfig(width=80, height=60, color="rgb", frames=2, stereo_m=0.06, field_of_view_deg=65)
 MONO = CameraConfig(width=80, height=60, color="grey", frames=2, stereo_m=0, field_of_view_deg=65)
@@ -190,7 +192,13 @@ def test_the_rays_of_a_film_end_at_the_walls(protocol, yaw_deg):
 def test_a_written_film_shows_its_last_frame_for_a_second(tmp_path):
     frames = [np.full((32, 48, 3), 20 * at, np.uint8) for at in range(10)]
     write_film(tmp_path / "lap.mp4", frames, len(frames), (48, 32), Console(file=io.StringIO()))
-    about, *written = read_frames(str(tmp_path / "lap.mp4"))
+
+    def read() -> list:
+        with suppress(OSError):  # the program's start may take longer than the library waits
+            return list(read_frames(str(tmp_path / "lap.mp4")))
+        return []
+
+    about, *written = wait_until(read)
     assert (about["fps"], about["size"]) == (30, (48, 32))
     assert len(written) == 10 + 30
     shades = [np.frombuffer(one, np.uint8).mean() for one in written]

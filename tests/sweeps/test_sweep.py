@@ -1,5 +1,6 @@
 """Parts of a sweep: its stopping rules, its parent, its run in MLflow, and its end."""
 
+import shutil
 import signal
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -91,7 +92,8 @@ def test_the_parent_is_resolved_when_a_study_is_begun_and_stays_the_same(trained
     assert _parent(compose_sweep(["study=p", LR]), None) is None
 
 
-def test_drivers_that_begin_at_once_share_one_run_in_mlflow(monkeypatch, tmp_path):
+def test_drivers_that_begin_at_once_share_one_run_in_mlflow(monkeypatch, tmp_path, empty_database):
+    shutil.copy(empty_database, tmp_path / "mlflow.db")
     monkeypatch.setattr(study_run, "Projector", ProjectorHere)
     request = compose_sweep(["study=spring", LR])
     space, store = SearchSpace.from_request(request), resolve_store(None, tmp_path)

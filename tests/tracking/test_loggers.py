@@ -14,6 +14,7 @@ from deepracer_exp.tracking.mlflow_metrics import METRICS, metric_name
 from deepracer_exp.tracking.projection import RunProjection
 from deepracer_exp.tracking.tracking_file import TrackedRun, write_tracked_run
 from tests.conftest import IN_PROCESS
+from tests.waiting import PATIENCE_S
 
 from .conftest import write_rows
 
@@ -102,8 +103,10 @@ def read_wandb(folder) -> list[dict[str, float]]:
     return rows
 
 
-def test_wandb_has_only_rows_that_a_checkpoint_covers_and_each_once(tmp_path, wait_until):
+def test_wandb_has_only_rows_that_a_checkpoint_covers_and_each_once(tmp_path, wait_until, monkeypatch):
     pytest.importorskip("wandb")
+    for variable in ("WANDB__SERVICE_WAIT", "WANDB_INIT_TIMEOUT"):  # for the start of W&B's own process
+        monkeypatch.setenv(variable, str(PATIENCE_S))
     config = WandbTracking(kind="wandb", project="deepracer-exp", entity=None, mode="offline")
     for status, steps in (("KILLED", [100, 200]), ("FINISHED", [100, 200, 300])):
         record(WandbProjection(config, tmp_path), ROWS, 2, status)

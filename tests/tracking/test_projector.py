@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from deepracer_exp.tracking.tracking_file import (
     write_tracked_run,
 )
 from tests.conftest import IN_PROCESS
-from tests.waiting import wait_until
+from tests.waiting import PATIENCE_S, wait_until
 
 from .conftest import ProjectorHere, TrackerHere, begin, points, write_rows
 
@@ -31,8 +32,11 @@ MODULE = "deepracer_exp.tracking.project"
 
 def processes(owner: psutil.Process | None = None) -> list[psutil.Process]:
     """Return the processes for trackers that this one, or `owner`, has started."""
-    children = (owner or psutil.Process()).children()
-    return [child for child in children if MODULE in child.cmdline()]
+    found = []
+    for child in (owner or psutil.Process()).children():
+        with suppress(psutil.Error):  # it has just ended
+            found += [child] * (MODULE in child.cmdline())
+    return found
 
 
 @pytest.fixture
@@ -51,7 +55,7 @@ def test_a_lost_process_is_replaced_and_nothing_is_recorded_twice(store, mlflow,
     lost.kill()
     lost.wait()
     write_rows(tmp_path, [{"kl": 0.25}])
-    tracker.finish("FINISHED")
+    tracker.finish("FINISHED", PATIENCE_S)
     assert tracker.failure is None
     assert processes() != [lost]
     assert points(mlflow, read_run_id(tmp_path), "kl") == [(100, 0.5), (200, 0.25)]

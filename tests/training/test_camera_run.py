@@ -5,6 +5,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import onnxruntime
+import psutil
 import pytest
 import torch
 from mlflow.models import Model
@@ -72,11 +73,15 @@ def test_the_stored_policy_and_its_onnx_file_see_the_same(trained, call, tmp_pat
     assert np.abs(theirs[0] - theirs[-1]).max() > 0
 
 
-def test_the_memory_of_pictures_is_shown_before_the_run_and_refused_with_what_fits(trained, copied, call):
+def test_the_memory_of_pictures_is_shown_before_the_run_and_refused_with_what_fits(
+    trained, copied, call, monkeypatch
+):
     started, resumed = trained(*CAMERA), call("resume", copied(*CAMERA).name, "budget.env_steps=384")
     for ended in (started, resumed):
         (line,) = (line for line in ended.stderr.splitlines() if line.startswith("pictures: "))
         assert "0.0 GB of memory for the 128 steps" in line
+    free = psutil.virtual_memory()._replace(available=8 * 2**30)
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: free)
     big = "algorithm.frames_per_iteration=10000000"
     refused = call("train", *IN_PROCESS, "observation=camera", "name=big", big)
     refused.assert_refused("up to ")

@@ -54,9 +54,8 @@ def test_the_rule_comes_to_the_runs_decision_by_the_rows_of_its_metrics_alone(tr
 @pytest.mark.processes
 def test_a_budgets_alerts_go_to_the_log_and_the_command(trained, tmp_path):
     command = tmp_path / "alert.sh"
-    command.write_text('#!/bin/sh\necho "$1" >> alerts.txt\n')
-    command.chmod(0o755)
-    ended = trained(*OFTEN, "budget.env_steps=1024", f"budget.alert_command={command}")
+    command.write_text('echo "$1" >> alerts.txt\n')
+    ended = trained(*OFTEN, "budget.env_steps=1024", f"budget.alert_command=sh {command}")
     # Commands run beside the training and each other.
     sent = sorted((ended.cwd / "alerts.txt").read_text().splitlines())
     assert sent == [
@@ -82,7 +81,7 @@ def ctrl_c_after(iterations, folder) -> None:
 def test_wherever_a_run_ends_its_last_policy_is_evaluated_and_all_name_the_same_best_one(
     train_here, call, tmp_path, end
 ):
-    own = (*OFTEN, "checkpoints.every=50", "stopping=none")
+    own = (*OFTEN, "checkpoints.every=1000000", "stopping=none")
     if end == "budget":
         ended = train_here(*own, *THREE)
     else:
@@ -92,7 +91,6 @@ def test_wherever_a_run_ends_its_last_policy_is_evaluated_and_all_name_the_same_
         assert "stopping: this iteration is finished" in ended.stderr
         assert re.search(rf" resume \S+/{ended.folder.name}\s", ended.stdout)
     last, best = ended.metrics[-1], ended.summary["best"]
-    assert last["iteration"] % 50 != 0
     assert best["iteration"] == last["iteration"]
     assert best["eval_completion"] == last["eval_completion"] is not None
     assert str((ended.folder / "checkpoints" / "best").readlink()) == f"{best['iteration']:06d}"
