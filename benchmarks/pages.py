@@ -33,16 +33,17 @@ import json, sys, time
 from pathlib import Path
 
 from deepracer_exp.config.parse import parse_experiment
-from deepracer_exp.env.setup import build_courses
+from deepracer_exp.env.setup import build_setup, usual_cars
 from deepracer_exp.reports.pages.run_page import write_pictures, write_run_page
 from deepracer_exp.runs.run_files import read_config
 from deepracer_exp.training import callbacks, run
 
 folder = Path(sys.argv[1])
 experiment = parse_experiment(read_config(folder))
-courses = build_courses(experiment)
+setup = build_setup(experiment)
+on_usual = usual_cars(setup.weights, experiment.randomization.car_share, experiment.collector.cars)
 began = time.process_time()
-write_pictures(folder, courses)
+write_pictures(folder, setup.courses, on_usual)
 drawn = time.process_time()
 note = write_run_page(folder, experiment.car)
 print(json.dumps({"pictures_s": drawn - began, "report_s": time.process_time() - drawn, "note": note}))

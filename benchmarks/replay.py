@@ -46,8 +46,6 @@ class Windows:
     standing: NDArray[np.bool_]
     """True where the car has just been put down at the start of the window, (M,). Its warm-up is the end of the
     episode before: putting the car down does not turn its wheels straight."""
-    iteration: NDArray[np.int64]
-    """The iteration that a window is from, (M,)."""
     episode: NDArray[np.int64]
     """The episode that it is from, numbered within the recording, (M,)."""
     left_out: int = 0
@@ -134,7 +132,6 @@ def cut_windows(
         duration_s=_durations(recorded, x, y)[at_rows[:, :-1]],
         first=first,
         standing=standing.astype(bool),
-        iteration=recorded["iteration"].to_numpy(np.int64)[at_rows[:, -1]],
         episode=episode,
         left_out=left_out,
     )

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from deepracer_exp.runs.run_result import RELIABLE
 
 from .race_protocol import Attempt
-from .zigzag import ZigZag, total_zigzag
+from .zigzag import ZigZag
 
 Metric = Literal["progress", "lap_time", "race_score", "reliable_lap"]
 Rank = tuple[float, float]
@@ -88,7 +88,7 @@ class TrialGroup:
     @property
     def zigzag(self) -> ZigZag:
         """The zig-zag on straights in all trials together."""
-        return total_zigzag(self.zigzags)
+        return sum(self.zigzags, ZigZag())
 
     def rank(self, metric: Metric) -> Rank:
         """Return the policy's rank by a metric; without a complete lap, times fall back to progress.

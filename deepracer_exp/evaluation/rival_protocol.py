@@ -1,5 +1,6 @@
 """Races of two cars under a protocol: the rival's laps and penalties, and who wins."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -54,8 +55,8 @@ class RivalProtocol:
             mine = [attempt for attempt in cars.attempts if attempt.trial == trial]
             theirs = [attempt for attempt in self._protocol.attempts if attempt.trial == trial]
             finish_s, rival_s = self._finish_s(mine), self._finish_s(theirs)
-            if finish_s is not None or rival_s is not None:
-                results.append(_compare(-_or_never(finish_s), -_or_never(rival_s)))
+            if min(finish_s, rival_s) < math.inf:
+                results.append(_compare(-finish_s, -rival_s))
             elif mine[-1].cut_off:
                 driven = sum(a.complete for a in mine) + (not mine[-1].complete) * mine[-1].progress / 100
                 results.append(_compare(driven, float(self._driven[trial])))
@@ -63,17 +64,13 @@ class RivalProtocol:
                 results.append(LOST)
         return tuple(results)
 
-    def _finish_s(self, attempts: list[Attempt]) -> float | None:
-        """Return the race clock at the end of the last lap; None if that was not completed."""
+    def _finish_s(self, attempts: list[Attempt]) -> float:
+        """Return the race clock at the end of the last lap; infinity if that was not completed."""
         complete = [attempt for attempt in attempts if attempt.complete]
         if self._laps is None or len(complete) < self._laps:
-            return None
+            return math.inf
         last = complete[self._laps - 1]
         return last.begin_s + last.time_s
-
-
-def _or_never(time_s: float | None) -> float:
-    return np.inf if time_s is None else time_s
 
 
 def _compare(mine: float, theirs: float) -> float:

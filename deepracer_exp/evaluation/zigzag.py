@@ -1,7 +1,6 @@
 """Zig-zag: frequency, amplitude and cost of steering from side to side on straights."""
 
 import math
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -142,11 +141,6 @@ def zigzag_of(
         swings_deg=swings_deg,
         detour_s=float((passed_s[moves] * (1 - np.cos(aside))).sum()),
     )
-
-
-def total_zigzag(parts: Iterable[ZigZag]) -> ZigZag:
-    """Return the sum of several."""
-    return sum(parts, ZigZag())
 
 
 def _changes(one_pass: NDArray[np.integer], steering_deg: Values) -> tuple[int, float]:

@@ -177,7 +177,7 @@ def trace_writer(folder: Path, kept: str) -> TraceWriter | None:
 
 def has_trace(folder: Path) -> bool:
     """Return whether there is a complete file of a trace."""
-    return any(not path.name.startswith(".") for path in folder.glob(f"*{_ENDING}"))
+    return any(folder.glob(f"[!.]*{_ENDING}"))
 
 
 def trace_files(folder: Path) -> list[Path]:
@@ -186,7 +186,7 @@ def trace_files(folder: Path) -> list[Path]:
     Raises:
         BadInput: there is none; the line says why.
     """
-    files = sorted(path for path in folder.glob(f"*{_ENDING}") if not path.name.startswith("."))
+    files = sorted(folder.glob(f"[!.]*{_ENDING}"))
     if not files:
         raise BadInput(folder, missing_trace(folder.parent), "the folder of a run with its trace")
     return files
@@ -207,17 +207,13 @@ def missing_trace(run: Path) -> str:
     )
 
 
-def read_others(folder: Path, least_iteration: int = 0) -> pa.Table | None:
+def read_others(folder: Path) -> pa.Table | None:
     """Read the boxes, bots and rivals of a trace, `env.others.placement.SCHEMA`; None where the car was alone.
 
     Raises:
         BadInput: a file is incomplete or of another kind.
     """
-    tables = []
-    for path in sorted(folder.glob(f"*{_OTHERS_ENDING}")):
-        if path.name.startswith(".") or int(path.name.partition("-")[0]) < least_iteration:
-            continue
-        tables.append(_read_others(path))
+    tables = [_read_others(path) for path in sorted(folder.glob(f"[!.]*{_OTHERS_ENDING}"))]
     return pa.concat_tables(tables) if tables else None
 
 
@@ -255,10 +251,6 @@ def read_evaluation_others(folder: Path) -> PlacedOthers | None:
 def _read_others(path: Path) -> pa.Table:
     try:
         table = pq.read_table(plain_file(path, _ACCEPTED, LOG_BYTES))
-        # Files of races without rivals may not have their columns.
-        for field in OTHERS_SCHEMA:
-            if field.name not in table.column_names and field.name.startswith(("rival_", "first_step")):
-                table = table.append_column(field, pa.nulls(len(table), field.type))
         return table.select(OTHERS_SCHEMA.names).cast(OTHERS_SCHEMA)
     except (OSError, pa.ArrowInvalid, KeyError, ValueError) as error:
         reason = " ".join(str(error).split())

@@ -166,11 +166,6 @@ def track_labels(names: Sequence[str]) -> list[str]:
     return labels
 
 
-def track_metric(metric: str, label: str) -> str:
-    """Return the name of one of TRACK_METRICS for a track's label."""
-    return f"{metric}/{label}"
-
-
 Point = tuple[str, float, int, int]
 """Key, value, time in ms, step."""
 

@@ -13,8 +13,6 @@ from .mlflow_metrics import BEST, METRICS
 from .store import open_client
 from .study_run import KIND, TRIAL
 
-_ENDED = {"FINISHED": "finished", "FAILED": "failed", "KILLED": "killed", "RUNNING": "running"}
-
 
 def rows_of_store(uri: str, runs_dir: Path) -> list[Row]:
     """Return a row for each run of an MLflow store, the newest first, without the runs of studies that group others.
@@ -32,7 +30,7 @@ def rows_of_store(uri: str, runs_dir: Path) -> list[Row]:
 def _of_store(run: Any, experiment: str) -> Row:
     tags: Mapping[str, str] = run.data.tags
     metrics: Mapping[str, float] = run.data.metrics
-    state = tags.get(END_TAG, "").partition(":")[0] or _ENDED.get(run.info.status, run.info.status)
+    state = tags.get(END_TAG, "").partition(":")[0] or run.info.status.lower()
     folder = Path(tags.get("run_dir", run.info.run_id)).name
     row = {
         "run": f"{experiment}/{folder}",

@@ -65,7 +65,7 @@ def plan_clone(parent: StoredRun, changes: Sequence[str], *, stored: bool = Fals
     return plan
 
 
-def read_parent(parent: StoredRun, clone: Experiment) -> "tuple[PolicyNetworks, Lineage]":
+def read_parent(parent: StoredRun) -> "tuple[PolicyNetworks, Lineage]":
     """Read a clone's initial networks and their lineage.
 
     Raises:

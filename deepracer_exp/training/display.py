@@ -16,8 +16,6 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from deepracer_exp.tracking.mlflow_metrics import track_metric
-
 logger = logging.getLogger("deepracer_exp")
 
 Row = Mapping[str, float | int | None]
@@ -320,7 +318,7 @@ class TrackTable:
         """Add the figures of an iteration."""
         for metric, series in (("completion", self._completion), ("best_lap_time_s", self._best_s)):
             for label in self._labels:
-                value = _value(row, track_metric(metric, label))
+                value = _value(row, f"{metric}/{label}")
                 if value is not None:
                     series[label] = value
 

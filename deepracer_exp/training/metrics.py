@@ -12,7 +12,7 @@ from deepracer_exp.env.rules import lap_clock_s
 from deepracer_exp.env.setup import RaceSetup
 from deepracer_exp.env.trace_columns import PACKED, STATUS_CODE
 from deepracer_exp.runs.fingerprint import REMEMBERED_EPISODES
-from deepracer_exp.tracking.mlflow_metrics import track_labels, track_metric
+from deepracer_exp.tracking.mlflow_metrics import track_labels
 
 TIMES = ("wall_clock_s", "collect_s", "update_s", "env_steps_per_s")
 """Columns of metrics.jsonl that differ between two runs of the same seed."""
@@ -174,7 +174,7 @@ class RunMetrics:
         for number, label in enumerate(self.labels):
             figures = _figures(finished.on(number), self.tracks[number])
             self._last[number] |= {key: value for key, value in figures.items() if value is not None}
-            row |= {track_metric(metric, label): value for metric, value in figures.items()}
+            row |= {f"{metric}/{label}": value for metric, value in figures.items()}
         return row
 
     def state_dict(self) -> dict[str, Any]:

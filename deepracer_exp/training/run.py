@@ -64,7 +64,7 @@ def run_training(
             return _run(reopen_run(plan, console, callbacks, report, run_name, tags, projector), interruption)
         start = None
         if plan.parent is not None:
-            start = read_parent(plan.parent, plan.experiment)
+            start = read_parent(plan.parent)
             for note in describe_clone(plan.parent, plan.experiment, start[1]):
                 printing(console)(note)
         setup = try_out(plan)

@@ -25,7 +25,6 @@ def windows(count: int, steps: int = 15) -> Windows:
         duration_s=np.full((count, rows), PERIOD_S),
         first=np.full(count, WARM_UP_STEPS),
         standing=np.full(count, True),
-        iteration=np.arange(count),
         episode=np.arange(count),
     )
 

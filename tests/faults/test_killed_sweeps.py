@@ -279,7 +279,7 @@ def test_a_sweep_that_ends_in_its_last_stage_resumes_the_clone_and_no_trial(
     rows = 1 + random.Random(seed).randrange(iterations // 2)
     running.wait_for(
         lambda: (
-            any(runs.glob("*-clone1/checkpoints/0*"))
+            any(runs.glob("*-clone1/checkpoints/last"))
             and sum(file.read_bytes().count(b"\n") for file in runs.glob("*-clone1/metrics.jsonl")) >= rows
         ),
         f"a checkpoint and {rows} rows of the clone",

@@ -90,9 +90,10 @@ def test_the_first_screen_is_what_was_raced_and_exploration_comes_below(html, vi
     assert read.text.rindex(result) < read.text.rindex("Findings") < read.text.rindex(headline(view))
     assert next(name for name in read.ids if name.startswith("figure")) == "figure-evaluated_lap"
     lap = raced_lap(view)
-    assert lap.words == f"The fastest evaluated lap: {times_s.min():.2f} s"
+    assert lap.title == f"The fastest evaluated lap: {times_s.min():.2f} s"
     assert "A lap of race." in read.text
-    assert len(lap.x_m) == pytest.approx(15 * times_s.min(), abs=2)
+    (dots,) = (layer for layer in lap.rows[0][0].layers if layer.get("mode") == "markers")
+    assert len(dots["x"]) == pytest.approx(15 * times_s.min(), abs=2)
     # A race without a training has its own laps as laps.
     assert raced_lap(prepare(made_up_recording([], evaluations={"race": [Drive()]}))) is None
 

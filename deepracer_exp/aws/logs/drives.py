@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from .log_files import Place
 from .recorded import STEP_COLUMNS, typed_table
-from .sim_trace import COMMON
+from .sim_trace import COMMON, step_keys
 from .text_log import TrainingLog
 
 EPISODES_PER_ITERATION = 20
@@ -39,9 +39,8 @@ class Drives:
 
     @cached_property
     def key(self) -> Ints:
-        """Episode and step in one number."""
-        episode, steps = (self.table[name].to_numpy().astype(np.int64) for name in ("episode", "steps"))
-        return (episode << 32) | steps
+        """`step_keys` of the rows."""
+        return step_keys(self.table)
 
     def choose(self, rows: Flags) -> "Drives":
         """Return some of the rows."""

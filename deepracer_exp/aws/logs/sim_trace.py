@@ -134,6 +134,12 @@ _LISTED_ACTION = re.compile(rb"(\[[^\[\],\n]*),")
 _QUOTED = re.compile(rb'"([^"\n]*)"')
 
 
+def step_keys(table: pa.Table) -> NDArray[np.int64]:
+    """Return episode and step of each row in one number."""
+    episode, steps = (table[name].to_numpy().astype(np.int64) for name in ("episode", "steps"))
+    return (episode << 32) | steps
+
+
 def with_plain_commas(rows: bytes) -> bytes:
     """Return rows of a trace in which every comma separates two columns.
 

@@ -8,12 +8,9 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import IO, Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from .blocks import Blocks
 from .log_files import LogFile
-from .sim_trace import LOG_LAYOUTS, StepTables, read_rows, with_plain_commas
+from .sim_trace import LOG_LAYOUTS, StepTables, read_rows, step_keys, with_plain_commas
 
 MARKER = b"SIM_TRACE_LOG:"
 """Precedes the values of a control step; anything may stand before it."""
@@ -309,12 +306,6 @@ def join_rolled(logs: Sequence[tuple[LogFile, TrainingLog]]) -> list[tuple[list[
     return joined
 
 
-def _places(log: TrainingLog) -> NDArray[np.int64]:
-    """Return episode and step of each row in one number."""
-    episode, step = (log.steps.whole[name].to_numpy().astype(np.int64) for name in ("episode", "steps"))
-    return (episode << 32) | step
-
-
 def _with_numbered(
     groups: dict[tuple[str | int, ...], list[tuple[LogFile, TrainingLog]]],
 ) -> list[list[tuple[LogFile, TrainingLog]]]:
@@ -325,7 +316,7 @@ def _with_numbered(
     joined = []
     for similar in alike.values():
         whole = sorted((piece for pieces in similar for piece in pieces), key=_time_of_piece)
-        places = [_places(log) for _, log in whole]
+        places = [step_keys(log.steps.whole) for _, log in whole]
         continues = all(map(len, places)) and all(
             later[0] > earlier.max() for earlier, later in pairwise(places)
         )

@@ -11,7 +11,6 @@ from tensordict import TensorDict
 from torch.distributions import Categorical
 
 from deepracer_exp.config.driving import ObservationConfig, RandomizationConfig
-from deepracer_exp.config.racing import RivalsConfig
 from deepracer_exp.env.observation import build_parts
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.randomization.car_randomization import CarStreams, Purpose
@@ -131,7 +130,8 @@ class HeadToHead(Race):
         self.rival.pace = np.ones(n_cars)
         assert isinstance(self.rival.others, RaceRival)
         self.rival.others.is_rival = True
-        self._training = None if evaluated else self._rivals_config(setup)
+        assert setup.others is not None
+        self._training = None if evaluated else setup.others.rivals
         self._policies: Sequence[torch.nn.Module] = ()
         self._share = np.zeros(n_cars)
         self._rival_percent = np.zeros(n_cars)
@@ -224,12 +224,6 @@ class HeadToHead(Race):
         self._share = checked_array(state, "rival_share", self._share.shape)
         self.rival.pace = checked_array(state, "rival_pace", self._share.shape)
         self._rival_percent = checked_array(state, "rival_percent", self._rival_percent.shape)
-
-    @staticmethod
-    def _rivals_config(setup: RaceSetup) -> RivalsConfig:
-        assert setup.others is not None
-        assert setup.others.rivals is not None
-        return setup.others.rivals
 
     def _update_opponents(self, ids: Ids) -> None:
         """Show the cars `ids` and their rivals to each other."""

@@ -200,10 +200,10 @@ def _lists(offsets: NDArray[np.intp], values: NDArray) -> pa.Array:
 
 
 def _parts(column: pa.ChunkedArray) -> list[NDArray[np.float32]]:
-    """Return the entries of a column of lists, some of which may be null."""
-    filled = column.combine_chunks()
-    values = filled.flatten().to_numpy(zero_copy_only=False)
-    lengths = filled.value_lengths().fill_null(0).to_numpy(zero_copy_only=False)
+    """Return the entries of a column of lists."""
+    whole = column.combine_chunks()
+    values = whole.flatten().to_numpy(zero_copy_only=False)
+    lengths = whole.value_lengths().to_numpy(zero_copy_only=False)
     return np.split(values, np.cumsum(lengths)[:-1]) if len(lengths) else []
 
 

@@ -108,12 +108,6 @@ def driven_m(course, front_point_m, com_x_m, states, begin_m, closed):  # type: 
 
 
 @njit(cache=True)
-def _roll(cars, drives, states, commands, steps, dt_s):  # type: ignore[no-untyped-def]
-    for n in range(len(commands)):
-        advance(cars, drives, states[n], commands[n], (steps, dt_s), states[n + 1])
-
-
-@njit(cache=True)
 def _penalty(short_m, multiplier, stiffness):  # type: ignore[no-untyped-def]
     """Return the augmented Lagrangian of a clearance `short_m` too small, and its derivatives by `short_m`."""
     pull = multiplier + stiffness * short_m

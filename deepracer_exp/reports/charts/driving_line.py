@@ -1,7 +1,5 @@
 """The driving line: sectors, speed, steering, slide and zig-zag, and its loss to the fastest lap."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import pandas as pd
 
@@ -68,31 +66,15 @@ def lap_line(view: LogView) -> Chart | None:
     )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class EvaluatedLap:
-    """A lap of a policy that takes its most probable actions; arrays (n,)."""
-
-    words: str
-    """Description of the lap, the title of its picture."""
-    whose: str
-    """Checkpoint, or the evaluation or race of a log."""
-    course: Track
-    x_m: Values
-    y_m: Values
-    speed_mps: Values
-    boxes: Values
-    """Corners of the boxes on the road, (k, 4, 2)."""
-
-
-def raced_lap(view: LogView) -> EvaluatedLap | None:
-    """Return the fastest lap of the evaluations and races beside a training; None without one."""
+def raced_lap(view: LogView) -> Chart | None:
+    """Draw the fastest lap of the evaluations and races beside a training; None without one."""
     laps_s = view.evaluation_episodes["lap_time_s"]
     if not view.trained or view.course is None or not laps_s.notna().any():
         return None
     number = int(np.nanargmin(laps_s.to_numpy(np.float64)))
     steps = view.evaluation_steps
     lap = steps[(np.cumsum(first_rows(steps)) - 1 == number) & steps["track_speed_mps"].notna()]
-    return EvaluatedLap(
+    return evaluated_lap(
         words=f"The fastest evaluated lap: {laps_s.iloc[number]:.2f} s",
         whose=str(view.evaluation_episodes["stream"].iloc[number]),
         course=view.course,
@@ -103,28 +85,27 @@ def raced_lap(view: LogView) -> EvaluatedLap | None:
     )
 
 
-def evaluated_lap(lap: EvaluatedLap) -> Chart:
-    """Draw an evaluated lap on the course, coloured by speed."""
-    hover = [f"driven {speed:.2f} m/s" for speed in lap.speed_mps]
+def evaluated_lap(
+    words: str, whose: str, course: Track, x_m: Values, y_m: Values, speed_mps: Values, boxes: Values
+) -> Chart:
+    """Draw a lap of a policy that takes its most probable actions, coloured by speed; arrays (n,).
+
+    `words` are the title; `whose` names the checkpoint, or the evaluation or race of a log. `boxes` are the corners of
+    those on the road, (k, 4, 2).
+    """
+    hover = [f"driven {speed:.2f} m/s" for speed in speed_mps]
     # The few steps after a standing start would take half of the colours.
-    low, high = float(np.percentile(lap.speed_mps, 10)), float(lap.speed_mps.max())
-    dots = colored_points(
-        lap.x_m,
-        lap.y_m,
-        lap.speed_mps,
-        "speed, m/s",
-        size=7.5,
-        hover=hover,
-        value_range=(low, max(high, low + 0.1)),
-    )
-    around = [outlines(lap.boxes, VERMILION, width=2.0)] if len(lap.boxes) else []
-    layers = [line(lap.x_m, lap.y_m, PALE, width=1.25), *around, dots]
+    low, high = float(np.percentile(speed_mps, 10)), float(speed_mps.max())
+    value_range = low, max(high, low + 0.1)
+    dots = colored_points(x_m, y_m, speed_mps, "speed, m/s", size=7.5, hover=hover, value_range=value_range)
+    around = [outlines(boxes, VERMILION, width=2.0)] if len(boxes) else []
+    layers = [line(x_m, y_m, PALE, width=1.25), *around, dots]
     return Chart(
         name="evaluated_lap",
-        title=lap.words,
-        caption=f"A lap of {lap.whose}. One dot for each control step, coloured by the speed of the car. In an "
+        title=words,
+        caption=f"A lap of {whose}. One dot for each control step, coloured by the speed of the car. In an "
         "evaluation the policy takes its most probable actions; while it trains it explores, and drives otherwise.",
-        rows=[[map_panel(lap.course, layers, numbers=False)]],
+        rows=[[map_panel(course, layers, numbers=False)]],
     )
 
 

@@ -9,7 +9,8 @@ from deepracer_exp.errors import BadInput, RunFailed
 from deepracer_exp.evaluation.evaluator import evaluator_against
 from deepracer_exp.evaluation.film import Lap, LapRecorder, best_attempt, drive_best_lap
 from deepracer_exp.evaluation.rival_run import kept_rival
-from deepracer_exp.reports.charts.driving_line import EvaluatedLap
+from deepracer_exp.reports.charts.driving_line import evaluated_lap
+from deepracer_exp.reports.charts.figure import Chart
 from deepracer_exp.reports.tables.log_view import LogView
 from deepracer_exp.runs.checkpoint_files import checkpoint_words, kept_checkpoints
 from deepracer_exp.runs.run_files import CHECKPOINTS, read_config
@@ -23,7 +24,7 @@ from .sight import glimpses
 class BestDrive:
     """The laps and views of a run's best policy."""
 
-    lap: EvaluatedLap | None = None
+    lap: Chart | None = None
     strip: tuple[Glimpse, ...] = ()
     """Pictures along a lap; empty for a policy without a camera."""
 
@@ -75,8 +76,8 @@ def drive_best(view: LogView, folder: Path, just_trained: bool = False) -> tuple
         return replace(view, problems=(*view.problems, LogProblem(view.name, None, str(error)))), BestDrive()
 
 
-def _shown(lap: Lap, checkpoint: str, what: str) -> EvaluatedLap:
-    """Return a lap of a checkpoint for its picture; in the prepare step the car stands.
+def _shown(lap: Lap, checkpoint: str, what: str) -> Chart:
+    """Draw a lap of a checkpoint; in the prepare step the car stands.
 
     `what` names a complete lap.
     """
@@ -86,7 +87,7 @@ def _shown(lap: Lap, checkpoint: str, what: str) -> EvaluatedLap:
         if attempt.complete
         else f"Evaluated, it comes {attempt.progress:.0f}% of the way"
     )
-    return EvaluatedLap(
+    return evaluated_lap(
         words=words,
         whose=checkpoint_words(checkpoint),
         course=lap.track,

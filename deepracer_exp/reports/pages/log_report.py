@@ -161,7 +161,7 @@ def draw_sections(page: LogPage) -> dict[str, list[Chart]]:
     unknown = _OF_FAILURES if view.laps_only else ()
     lap = page.best.lap if page.best is not None else driving_line.raced_lap(view)
     if lap is not None:
-        drawn[_EVALUATED] = [driving_line.evaluated_lap(lap)]
+        drawn[_EVALUATED] = [lap]
     drawn |= {
         title: [draw_one(view) for draw_one in some] if title not in unknown else []
         for title, some in sections.items()

@@ -13,9 +13,11 @@ from optuna.storages import RDBStorage
 from optuna.study import Study, StudyDirection
 
 from deepracer_exp.addresses import redact
+from deepracer_exp.config.compose import Composition
 from deepracer_exp.config.dimension import Choice
 from deepracer_exp.config.options import groups
-from deepracer_exp.config.sweep import SweepRequest
+from deepracer_exp.config.overrides import group_of, key_of, override_line
+from deepracer_exp.config.sweep import SweepRequest, compose_sweep
 from deepracer_exp.errors import BadInput, nearest
 from deepracer_exp.runs.lineage import read_lineage
 from deepracer_exp.runs.run_files import SUMMARY, read_config, read_object
@@ -28,11 +30,7 @@ from .claims import TABLE, TrialClaims
 from .storage import open_storage, resolve_database
 from .widening import complete_widening, widen
 
-if TYPE_CHECKING:  # finding a study needs no composition
-    from deepracer_exp.config.compose import Composition
-    from deepracer_exp.config.sweep import SweepRequest
-    from deepracer_exp.sweeps.search.space import SearchSpace
-
+if TYPE_CHECKING:
     from .worker_config import Parent
 
 _log = logging.getLogger("deepracer_exp")
@@ -83,8 +81,8 @@ def load_study(name: str, storage: RDBStorage) -> Study:
 
 
 def with_stored(
-    request: "SweepRequest", overrides: Sequence[str]
-) -> tuple[Sequence[str], "SweepRequest", Study | None]:
+    request: SweepRequest, overrides: Sequence[str]
+) -> tuple[Sequence[str], SweepRequest, Study | None]:
     """Return the overrides of a sweep, the request they make, and its study if that exists.
 
     Overrides that only name a study are preceded by those that the study was begun with, and composed with them.
@@ -92,9 +90,6 @@ def with_stored(
     Raises:
         BadInput: an override is not accepted, there is nothing to search, or there is no study of that name to resume.
     """
-    from deepracer_exp.config.overrides import key_of, override_line
-    from deepracer_exp.config.sweep import compose_sweep
-
     keys = set(map(key_of, overrides))
     names_only = not {key for key in keys if not key.startswith(_EXECUTOR)} - {*MAY_DIFFER}
     study = _existing(request, names_only)
@@ -119,9 +114,9 @@ def with_stored(
 
 
 def open_study(
-    request: "SweepRequest",
+    request: SweepRequest,
     overrides: Sequence[str],
-    space: "SearchSpace",
+    space: SearchSpace,
     parent: "Parent | None",
     storage: RDBStorage,
     runs_dir: Path,
@@ -134,8 +129,6 @@ def open_study(
         BadInput: a study of that name exists, and its trials cannot be compared with these; or one of them is running
             and the search is a wider one.
     """
-    from deepracer_exp.config.overrides import key_of
-
     from .worker_config import plan_trial
 
     name, sweep = request.study, request.entry.sweep
@@ -175,7 +168,7 @@ def open_study(
         differences = _differences(stored, wanted, {*space.as_text()} - {*stored["space"]})
         if changes and not differences and space.is_wider_than(stored["space"]):
 
-            def composed(lines: list[str]) -> "Composition":
+            def composed(lines: list[str]) -> Composition:
                 return plan_trial(lines, parent, stored=True).composition
 
             if sweep.sampler == "grid":
@@ -213,8 +206,6 @@ def _expanded(override: str, space: Mapping[str, str]) -> str:
 
 def _differences(stored: dict[str, object], wanted: dict[str, object], searched: set[str]) -> list[str]:
     """Return a line for each difference that makes trials incomparable; `searched` are keys that were not before."""
-    from deepracer_exp.config.overrides import key_of
-
     lines = [f"{key}: {stored.get(key)} -> {wanted[key]}" for key in _SAME if stored.get(key) != wanted[key]]
     before, now = (
         [
@@ -234,12 +225,10 @@ def _differences(stored: dict[str, object], wanted: dict[str, object], searched:
 
 def _chooses_processes(override: str) -> bool:
     """Return whether an override only chooses the processes of a trial's cars, which does not change the trial."""
-    from deepracer_exp.config.overrides import group_of, key_of
-
     return group_of(override) == "collector" and key_of(override) != "collector.cars"
 
 
-def _existing(request: "SweepRequest", must_exist: bool) -> Study | None:
+def _existing(request: SweepRequest, must_exist: bool) -> Study | None:
     """Return the study that the request names, if it exists; no file is created by looking."""
     if request.entry.study is None and must_exist:
         return None

@@ -6,20 +6,19 @@ then under its own. If the process is killed in between, the next start of the s
 
 import copy
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import optuna
 from optuna.storages import RDBStorage
 from optuna.study import Study
 from optuna.trial import FrozenTrial, TrialState
 
+from deepracer_exp.config.compose import Composition
+from deepracer_exp.config.options import groups
 from deepracer_exp.errors import BadInput
+from deepracer_exp.sweeps.search.space import Dimension, SearchSpace, value_at
 
 from .claims import TrialClaims, report_results
-
-if TYPE_CHECKING:  # finding a study needs no composition
-    from deepracer_exp.config.compose import Composition
-    from deepracer_exp.sweeps.search.space import Dimension, SearchSpace
 
 COMPLETE = "is_complete"
 """Attribute of a wider study under its first name: it has all trials, and replaces the other one."""
@@ -48,7 +47,7 @@ def complete_widening(name: str, storage: RDBStorage) -> None:
 def widen(
     study: Study,
     storage: RDBStorage,
-    space: "SearchSpace",
+    space: SearchSpace,
     attributes: Mapping[str, Any],
     composed: "Callable[[list[str]], Composition]",
 ) -> Study:
@@ -96,7 +95,7 @@ def widen(
 
 
 def _in_space(
-    trial: FrozenTrial, space: "SearchSpace", composed: "Callable[[list[str]], Composition]"
+    trial: FrozenTrial, space: SearchSpace, composed: "Callable[[list[str]], Composition]"
 ) -> FrozenTrial:
     """Return a trial as one of the wider space; samplers' attributes are left out."""
     moved = copy.deepcopy(trial)
@@ -116,20 +115,17 @@ def _in_space(
     return moved
 
 
-def _in_dimension(axis: "Dimension", value: Any) -> Any:
+def _in_dimension(axis: Dimension, value: Any) -> Any:
     """Return a value of a narrower dimension; a whole number may have become one of any numbers."""
     return float(value) if isinstance(axis.distribution, optuna.distributions.FloatDistribution) else value
 
 
-def _counts(axis: "Dimension", params: Mapping[str, Any]) -> bool:
+def _counts(axis: Dimension, params: Mapping[str, Any]) -> bool:
     return axis.options is None or params.get(str(axis.group)) in axis.options
 
 
-def _trained_with(axis: "Dimension", composition: "Composition") -> list[Any]:
+def _trained_with(axis: Dimension, composition: Composition) -> list[Any]:
     """Return the value that a trial was trained with; an empty list if it is not searched."""
-    from deepracer_exp.config.options import groups
-    from deepracer_exp.sweeps.search.space import value_at
-
     if axis.key in groups():
         plain = [composition.choices[axis.key]] if axis.key in composition.choices else []
     else:

@@ -43,7 +43,8 @@ class Parent:
         """
         try:
             parent = resolve(run, runs_dir, uri).with_checkpoint()
-            _, lineage = read_parent(parent, plan_clone(parent, [f"name={study}"]).experiment)
+            plan_clone(parent, [f"name={study}"])
+            _, lineage = read_parent(parent)
             pin(parent.path / CHECKPOINTS, lineage.checkpoint, f"cloned by the study {study}")
         except BadInput as error:
             raise BadInput(f"parent={run}", error.without(run)) from error

@@ -186,9 +186,3 @@ def narrowed(figure: Figure) -> Figure:
     layout = figure["layout"]
     narrow = layout | base_layout(layout["meta"]["title"], NARROW_WIDTH)
     return figure | {"layout": narrow | {"legend": {"orientation": "h", "y": -0.3}}}
-
-
-def least_width(figure: Figure) -> int:
-    """Return the pixels below which a figure scrolls sideways, 0 if it gets as narrow as the page."""
-    width: int = figure["layout"]["meta"]["least_width"]
-    return width

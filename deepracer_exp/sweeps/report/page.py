@@ -28,7 +28,7 @@ from deepracer_exp.sweeps.search.objectives import (
 from deepracer_exp.sweeps.trial import Trial
 
 from .best_trial import best_line, best_run, best_shown, best_trial, complete_trials, over_seeds, reranked
-from .figures import FEWEST_COMPLETE, figures, importances, least_width, narrowed
+from .figures import FEWEST_COMPLETE, figures, importances, narrowed
 from .last_race import last_race, race_rows
 from .wording import ENDINGS, duration, ending_of, ending_words, parameter, short_keys, steps
 
@@ -56,10 +56,10 @@ def study_page(study: optuna.Study) -> str:
     objectives = objectives_of(study)
     trials = study.get_trials(deepcopy=False)
     complete = complete_trials(study)
-    plots = [
-        plot(figure, name, figure["layout"]["meta"]["title"], narrowed(figure), least_width(figure))
-        for name, figure in figures(study).items()
-    ]
+    plots = []
+    for name, figure in figures(study).items():
+        meta = figure["layout"]["meta"]
+        plots.append(plot(figure, name, meta["title"], narrowed(figure), meta["least_width"]))
     keys = short_keys(sorted({key for trial in trials for key in trial.params}))
     return render(
         "deepracer_exp.sweeps.report",

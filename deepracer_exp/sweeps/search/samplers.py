@@ -159,10 +159,6 @@ _SAMPLERS: dict[str, Callable[[SweepConfig, SearchSpace, int, int], BaseSampler]
 """Samplers by name, from (sweep, space, number of the trial, seed of the trial)."""
 
 
-def _distributions(space: SearchSpace) -> dict[str, BaseDistribution]:
-    return {dimension.key: dimension.distribution for dimension in space.dimensions}
-
-
 def _check_cmaes(config: SweepConfig, space: SearchSpace) -> None:
     others = ", ".join(name for name in SAMPLERS if name != "cmaes")
     if len(config.objectives) > 1:
@@ -170,9 +166,7 @@ def _check_cmaes(config: SweepConfig, space: SearchSpace) -> None:
             f"sweep.sampler=cmaes: follows one objective, and sweep.objectives has {len(config.objectives)}; "
             f"accepted with several: {others}"
         )
-    if all(
-        isinstance(distribution, CategoricalDistribution) for distribution in _distributions(space).values()
-    ):
+    if all(isinstance(dimension.distribution, CategoricalDistribution) for dimension in space.dimensions):
         raise BadInput(
             "sweep.sampler=cmaes",
             f"searches ranges, and the space has choices only; accepted for them: {others}",

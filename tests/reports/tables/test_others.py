@@ -5,7 +5,6 @@ import tarfile
 
 import numpy as np
 import pandas as pd
-import pyarrow.parquet as pq
 import pytest
 
 from deepracer_exp.aws.logs.reader import read_recording
@@ -13,7 +12,6 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.others.placement import (
     PlacedOthers,
     Placement,
-    read_placements,
     rebuild_poses,
 )
 from deepracer_exp.reports.charts.others_charts import crash_free, crash_places, crashes_by_object, overtakes
@@ -22,7 +20,6 @@ from deepracer_exp.reports.pages.log_report import LogPage, draw_sections
 from deepracer_exp.reports.tables.log_view import prepare
 from deepracer_exp.reports.tables.others_on_road import costliest, others_on_road
 from deepracer_exp.runs.recording import read_run_recording
-from deepracer_exp.runs.trace import read_others
 from deepracer_exp.tracks.track import directed_tracks
 
 ON_ROAD = "What is on the road"
@@ -57,21 +54,6 @@ def test_every_crash_of_a_run_has_the_box_or_bot_that_the_car_is_in(mixed):
         )
         away_m = np.hypot(*(poses[0, :, :2] - [drove["X"], drove["Y"]]).T)
         assert away_m[other] < 0.6
-
-
-def test_files_of_before_there_were_rivals_are_read(mixed, tmp_path):
-    """They have none of the columns about rivals."""
-    (trace,) = {file.parent for file in mixed.recording.files if file.suffix == ".parquet"}
-    assert read_others(trace).column_names[-1] == "rival_yaw_deg"
-    for file in trace.glob("*-others.parquet"):
-        table = pq.read_table(file)
-        old = [name for name in table.column_names if not name.startswith(("rival", "first"))]
-        pq.write_table(table.select(old), tmp_path / file.name)
-    placed, expected = read_placements(read_others(tmp_path)), mixed.placed.episodes
-    assert placed[False].keys() == expected[False].keys()
-    for number, drawn in placed[False].items():
-        np.testing.assert_array_equal(drawn.places_m, expected[False][number].places_m)
-        np.testing.assert_array_equal(drawn.stopped_at_s, expected[False][number].stopped_at_s)
 
 
 def test_a_report_of_a_run_among_others_begins_with_its_laps_without_a_crash(mixed):
