@@ -165,7 +165,7 @@ _RESUME_EPILOG = """\
   deepracer-exp resume RUN stopping=none                    resume a run that its stopping rule ended, until its
                                                             budget is used
 
-The run continues from its last checkpoint, in its own folder and in the same MLflow run (a copy of a run's folder in a
+The run continues from its last checkpoint, in its own folder and in the same MLflow run (a copy within runs_dir in a
 new one); what it wrote after that checkpoint is overwritten. The result equals that of an uninterrupted run, bit for
 bit, except with a budget in minutes. A reward function that keeps something between calls starts without it.
 With a larger budget a learning rate and an entropy bonus that follow the budget rise again, and the command says so;

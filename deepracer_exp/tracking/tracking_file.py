@@ -10,7 +10,7 @@ from pydantic import TypeAdapter
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.files import atomic_write, read_json_as
-from deepracer_exp.runs.run_files import MLFLOW, TRACKING, read_run_id
+from deepracer_exp.runs.run_files import MLFLOW, TRACKING
 
 Status = Literal["FINISHED", "FAILED", "KILLED"]
 
@@ -143,23 +143,33 @@ def note_problem(folder: Path, problem: str) -> None:
 
 
 def is_copy(run_dir: Path) -> bool:
-    """Return whether a run's folder was copied, and the original, which has the run in MLflow, is still there.
+    """Return whether a run's folder was copied, and the original, the same run for a tracker, can still be read.
 
     Where all runs were copied as a whole, those beside the copy count.
 
     Raises:
-        BadInput: a file is missing or invalid.
+        BadInput: the `tracking.json` of the folder is missing or invalid.
     """
-    recorded = Path(read_tracked_run(run_dir).tags.get("run_dir", run_dir))
-    beside = run_dir.parents[1] / recorded.parent.name / recorded.name
-    original = beside if beside.exists() else recorded
-    run_id = read_run_id(run_dir)
-    return run_id is not None and original.resolve() != run_dir.resolve() and read_run_id(original) == run_id
+    run = read_tracked_run(run_dir)
+    recorded = Path(run.tags.get("run_dir", run_dir))
+    beside = run_dir.parent.parent / recorded.parent.name / recorded.name
+    try:
+        original = beside if beside.exists() else recorded
+        other = read_tracked_run(original)
+        return not original.samefile(run_dir) and _identity(other) == _identity(run)
+    except (BadInput, OSError, ValueError):  # it is gone, or not ours to read
+        return False
+
+
+def _identity(run: TrackedRun) -> tuple[object, ...]:
+    return run.start_ms, run.run_name, run.experiment, run.tags.get("run_dir")
 
 
 def begin_again(folder: Path, run_dir: Path) -> None:
     """Turn a copy of a run's folder into a run of its own, which will lie at `run_dir`."""
-    run = read_tracked_run(folder)
-    tags = {**run.tags, "run_dir": str(run_dir.resolve())}
-    write_tracked_run(folder, replace(run, run_id=None, tags=tags, complete=False))
+    run, place = read_tracked_run(folder), str(run_dir.resolve())
+    # First: killed in between, the copy is found to be one again.
     (folder / MLFLOW).unlink(missing_ok=True)
+    # The description names the folder, too.
+    tags = {key: value.replace(run.tags.get("run_dir", place), place) for key, value in run.tags.items()}
+    write_tracked_run(folder, replace(run, run_id=None, tags=tags, complete=False))

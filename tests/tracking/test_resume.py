@@ -8,7 +8,13 @@ from mlflow import MlflowClient
 
 from deepracer_exp.errors import BadInput
 from deepracer_exp.tracking.store import resolve_store
-from deepracer_exp.tracking.tracking_file import begin_again, is_copy, read_tracked_run
+from deepracer_exp.tracking.tracking_file import (
+    TrackedRun,
+    begin_again,
+    is_copy,
+    read_tracked_run,
+    write_tracked_run,
+)
 
 from .conftest import TrackerHere, begin, cover, points, runs_of, write_rows
 
@@ -158,7 +164,6 @@ def test_a_copy_of_a_run_is_another_run_of_the_store_with_all_rows(store, mlflow
     copy = shutil.copytree(original, original.with_name("copy"), symlinks=True)
     assert (is_copy(original), is_copy(copy)) == (False, True)
     begin_again(copy, copy)
-    assert not is_copy(copy)
     own = reopened(store, copy)
     write_rows(copy, rows_until(12)[10:])
     own.finish("FINISHED")
@@ -166,8 +171,44 @@ def test_a_copy_of_a_run_is_another_run_of_the_store_with_all_rows(store, mlflow
     assert {run.info.run_id for run in runs_of(mlflow)} == {tracker.run_id, own.run_id}
     assert points(mlflow, tracker.run_id) == logged_until(10)
     assert points(mlflow, own.run_id) == logged_until(12)
-    whole = shutil.copytree(tmp_path / "race", tmp_path / "moved" / "race", symlinks=True)
-    assert not is_copy(whole / "run")
+
+
+@pytest.fixture
+def run_and_copy(tmp_path):
+    """Return the folders of a run that no store has answered yet, and of its copy."""
+    run = tmp_path / "race" / "run"
+    run.mkdir(parents=True)
+    write_tracked_run(run, TrackedRun("run", "race", 1, tags={"run_dir": str(run), "note": f"in {run}"}))
+    return run, shutil.copytree(run, run.with_name("copy"))
+
+
+def test_a_copy_is_one_until_it_begins_again(run_and_copy, tmp_path):
+    run, copy = run_and_copy
+    assert (is_copy(run), is_copy(copy)) == (False, True)
+    (tmp_path / "link").symlink_to(tmp_path / "race")
+    assert not is_copy(tmp_path / "link" / "run")
+    assert not is_copy(shutil.copytree(tmp_path / "race", tmp_path / "whole" / "race") / "run")
+    begin_again(copy, copy)
+    assert not is_copy(copy)
+    assert read_tracked_run(copy).tags == {"run_dir": str(copy), "note": f"in {copy}"}
+
+
+@pytest.mark.parametrize("lost", ["gone", "corrupt", "another run"])
+def test_where_the_original_is_lost_the_copy_is_the_run(run_and_copy, lost):
+    run, copy = run_and_copy
+    if lost == "gone":
+        shutil.rmtree(run)
+    elif lost == "corrupt":
+        (run / "tracking.json").write_text("{")
+    else:
+        write_tracked_run(run, TrackedRun("run", "race", 2, tags={"run_dir": str(run)}))
+    assert not is_copy(copy)
+
+
+@pytest.mark.parametrize("recorded", ["/" + 300 * "x", "nul\0", "~" + 5000 * "/x"])
+def test_a_place_that_cannot_be_looked_at_has_no_original(tmp_path, recorded):
+    write_tracked_run(tmp_path, TrackedRun("run", "race", 1, tags={"run_dir": recorded}))
+    assert not is_copy(tmp_path)
 
 
 def test_a_resumed_run_is_shown_as_running(store, mlflow, tmp_path, killed, wait_until):

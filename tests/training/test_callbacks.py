@@ -112,7 +112,9 @@ def test_a_copy_of_a_copy_is_another_run_of_mlflow_and_has_one_attempt_in_its_na
     after = json.loads((copy / "tracking.json").read_text())
     assert (read_run_id(copy), after["tags"]["run_dir"]) == (None, str(copy.resolve()))
     assert copy.name == f"{first.name}-attempt3"
-    assert {**after["tags"], "run_dir": ""} == {**before["tags"], "run_dir": ""}
+    old, new = str(first.resolve()), str(copy.resolve())
+    assert after["tags"] == {key: value.replace(old, new) for key, value in before["tags"].items()}
+    assert f"Run folder: `{new}`" in after["tags"]["mlflow.note.content"]
 
 
 def test_a_callback_adds_a_column_to_the_metrics(tmp_path):
