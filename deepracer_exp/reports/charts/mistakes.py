@@ -36,7 +36,7 @@ def visits_map(view: LogView) -> Chart | None:
         ("all iterations", cell),
         ("last third of the iterations", np.where(late, cell, -1)),
     ):
-        steps = totals(place, None, grid.count)
+        steps = totals(place, grid.count)
         seen = np.where(steps > 0, steps, np.nan)
         # The start positions would take all colours.
         top = float(np.nanpercentile(seen, 98)) if np.isfinite(seen).any() else 1.0
@@ -66,7 +66,7 @@ def episode_ends_map(view: LogView) -> Chart | None:
         here = ends[ends["status"] == status]
         if not len(here):
             continue
-        height = totals(here["waypoint"].to_numpy(np.intp), None, n)
+        height = totals(here["waypoint"].to_numpy(np.intp), n)
         counted.append(bars(np.arange(n), height, color, f"{words} ({len(here)})", base=base, width=1.0))
         base = base + height
         shown = here.iloc[subsample(len(here), 1500)]
