@@ -19,7 +19,6 @@ Wanted: at most 20 s and 1.5 GB on two cores for the 44,247 steps of the console
 """
 
 import logging
-import os
 import re
 import statistics
 import sys
@@ -30,10 +29,9 @@ from pathlib import Path
 from typing import Any
 
 from deepracer_exp.aws.logs.reader import read_recording
-from deepracer_exp.errors import BadInput
 
-from .command import command_line
-from .report import benchmark_parser, number, table, write_json
+from .command import spent
+from .report import benchmark_parser, number, table, with_exit_code, write_json
 
 CONSOLE_TRAINING = Path(__file__).parents[2] / "shared/reference/console_training"
 WANTED = {"report_s": 20.0, "peak_gb": 1.5, "read_ratio": 1.0}
@@ -50,15 +48,7 @@ def report(path: Path, page: Path) -> tuple[float, float]:
     Raises:
         SystemExit: the command did not end with exit code 0.
     """
-    line = command_line("analyze", str(path), "--output", str(page))
-    began = time.perf_counter()
-    child = os.posix_spawn(
-        line[0], line, os.environ, file_actions=[(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]
-    )
-    _, status, usage = os.wait4(child, 0)
-    seconds = time.perf_counter() - began
-    if status != 0:
-        raise SystemExit(f"{' '.join(line)}: exit code {os.waitstatus_to_exitcode(status)}")
+    seconds, usage = spent("analyze", str(path), "--output", str(page))
     unit = 1 if sys.platform == "darwin" else 1024
     return seconds, usage.ru_maxrss * unit / 1e9
 
@@ -194,21 +184,17 @@ def show(figures: dict[str, Any]) -> str:
     return table((f"{figures['steps']:,} steps", "measured", "wanted"), rows)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@with_exit_code
+def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and print."""
     parser = benchmark_parser("analysis", __doc__, None)
     parser.add_argument("--path", type=Path, default=CONSOLE_TRAINING, help="logs in a layout that both know")
     parser.add_argument("--turns", type=int, default=7, help="readings of each")
     parser.add_argument("--long-gb", type=float, default=0.0, help="size of a long log, none without")
     options = parser.parse_args(arguments)
-    try:
-        figures = measure(options.path, options.turns, options.long_gb)
-    except BadInput as error:
-        print(error, file=sys.stderr)
-        return error.exit_code
+    figures = measure(options.path, options.turns, options.long_gb)
     print(show(figures))
     write_json(options.json, figures)
-    return 0
 
 
 if __name__ == "__main__":

@@ -1,6 +1,8 @@
 """The real `deepracer-exp`, run as a racer runs it."""
 
 import json
+import os
+import resource
 import subprocess
 import sys
 import time
@@ -48,6 +50,23 @@ def run_benchmark(name: str, *arguments: str) -> dict[str, Any]:
         raise SystemExit(f"{' '.join(line)}: exit code {done.returncode}\n{done.stderr}")
     found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return found
+
+
+def spent(*arguments: str) -> tuple[float, resource.struct_rusage]:
+    """Return the seconds from start to end of `deepracer-exp ARGUMENTS`, and what it used.
+
+    Raises:
+        SystemExit: the command did not end with exit code 0.
+    """
+    line = command_line(*arguments)
+    began = time.perf_counter()
+    child = os.posix_spawn(
+        line[0], line, os.environ, file_actions=[(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]
+    )
+    _, status, usage = os.wait4(child, 0)
+    if status != 0:
+        raise SystemExit(f"{' '.join(line)}: exit code {os.waitstatus_to_exitcode(status)}")
+    return time.perf_counter() - began, usage
 
 
 def trained(folder: Path, overrides: Sequence[str]) -> Path:

@@ -22,12 +22,10 @@ from typing import Any
 
 import torch
 
-from deepracer_exp.agents.build import build_networks
 from deepracer_exp.config.compose import compose_evaluation
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.env.action_space import build_action_space
-from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.evaluation.evaluator import Evaluator
+from deepracer_exp.runs.checkpoints import networks_of
 from deepracer_exp.runs.stored_run import StoredRun
 
 from .command import trained
@@ -41,13 +39,7 @@ _KEPT = ("experiment=head_to_head", "checkpoints.keep=1000", "report=false", "tr
 
 def first_policy(experiment: Experiment) -> torch.nn.Module:
     """Return the policy with which a training of the experiment begins."""
-    return build_networks(
-        experiment.network,
-        experiment.algorithm,
-        observation_shape(experiment.observation),
-        build_action_space(experiment.action_space).n,
-        torch.Generator().manual_seed(experiment.seed),
-    ).policy
+    return networks_of(experiment, torch.Generator().manual_seed(experiment.seed)).policy
 
 
 def race(evaluator: Evaluator, policy: torch.nn.Module, rival: torch.nn.Module) -> dict[str, Any]:

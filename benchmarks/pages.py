@@ -14,7 +14,6 @@ steps is made first.
 """
 
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -23,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from .analysis import CONSOLE_TRAINING, write_long_log
-from .command import command_line, train
+from .command import spent, train
 from .report import benchmark_parser, number, table, with_exit_code, write_json
 
 WANTED = {"report_s": 1.0, "study_s": 1.0, "analyze_s": 5.0}
@@ -69,13 +68,7 @@ def of_command(*arguments: str) -> float:
     Raises:
         SystemExit: the command did not end with exit code 0.
     """
-    line = command_line(*arguments)
-    child = os.posix_spawn(
-        line[0], line, os.environ, file_actions=[(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]
-    )
-    _, status, usage = os.wait4(child, 0)
-    if status != 0:
-        raise SystemExit(f"{' '.join(line)}: exit code {os.waitstatus_to_exitcode(status)}")
+    _, usage = spent(*arguments)
     return usage.ru_utime + usage.ru_stime
 
 

@@ -40,17 +40,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from deepracer_exp.agents.build import build_networks
 from deepracer_exp.collectors.collector import Collector
 from deepracer_exp.collectors.forking import start_workers_early
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.config.driving import RewardConfig
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.env.race import Race
 from deepracer_exp.env.race_env import RaceEnv
 from deepracer_exp.env.setup import RaceSetup, build_setup
 from deepracer_exp.rewards.source import load_reward_source, source_with_constants
+from deepracer_exp.runs.checkpoints import networks_of
 from deepracer_exp.sim.batch import CarBatch, cores
 
 from .all_tracks import TRACKS
@@ -205,11 +204,7 @@ def collecting(experiment: Experiment, rounds: int, seconds: float, folder: Path
     frames = experiment.algorithm.frames_per_iteration
     assert frames is not None, "an iteration must be counted in frames"
     setup = build_setup(experiment)
-    generator = torch.Generator().manual_seed(experiment.seed)
-    observed = observation_shape(experiment.observation)
-    policy = build_networks(
-        experiment.network, experiment.algorithm, observed, setup.actions.n, generator
-    ).policy
+    policy = networks_of(experiment, torch.Generator().manual_seed(experiment.seed)).policy
 
     def start(processes: int) -> Collector:
         config = dataclasses.replace(experiment.collector, mode="sync", processes=processes)

@@ -74,11 +74,6 @@ class Tab:
             " drawn.forEach((box, at) => { box.dataset.state = states[at]; }); })()"
         )
 
-    def prepare_print(self) -> None:
-        """Let the page do what it does before and after it is printed."""
-        for event in ("beforeprint", "afterprint"):
-            self.evaluate(f"window.dispatchEvent(new Event('{event}'))")
-
     def prefer(self, scheme: str) -> None:
         """Let pages know that the reader prefers `light` or `dark`."""
         feature = {"name": "prefers-color-scheme", "value": scheme}

@@ -123,9 +123,10 @@ assert users.doubled(2.0) == 4.0
     (tmp_path / "users.py").write_text(
         "from numba import njit\n\n@njit(cache=True)\ndef doubled(x):\n    return 2 * x\n"
     )
+    kept = Path(os.environ.get("NUMBA_CACHE_DIR") or tmp_path / "__pycache__")
+    before = set(kept.rglob("users.doubled-*.nbi"))
     forked = multiprocessing.Process(target=exec, args=(code,))
     forked.start()
     forked.join()
     assert forked.exitcode == 0
-    kept = Path(os.environ.get("NUMBA_CACHE_DIR") or tmp_path / "__pycache__")
-    assert list(kept.rglob("users.doubled-*.nbi"))
+    assert set(kept.rglob("users.doubled-*.nbi")) > before

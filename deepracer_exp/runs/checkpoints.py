@@ -48,6 +48,17 @@ class StoredPolicy:
     """Iteration, env steps and the like at which it was saved."""
 
 
+def networks_of(experiment: Experiment, generator: torch.Generator | None) -> PolicyNetworks:
+    """Build the networks of an experiment; the generator and errors are as for `build_actor_critic`."""
+    return build_networks(
+        experiment.network,
+        experiment.algorithm,
+        observation_shape(experiment.observation),
+        build_action_space(experiment.action_space).n,
+        generator,
+    )
+
+
 def read_checkpoint(experiment: Experiment, folder: Path, name: str) -> StoredPolicy:
     """Read the networks of a checkpoint, or of the newest intact one if one of `LINKS` is corrupt.
 
@@ -108,13 +119,7 @@ def read_policy(experiment: Experiment, path: Path) -> StoredPolicy:
     Raises:
         BadInput: it does not fit the experiment, or a weight is not finite.
     """
-    networks = build_networks(
-        experiment.network,
-        experiment.algorithm,
-        observation_shape(experiment.observation),
-        build_action_space(experiment.action_space).n,
-        torch.Generator(),
-    )
+    networks = networks_of(experiment, torch.Generator())
     stored, problem = State({}), "does not fit the run's config.yaml"
     counters = load_component(path, AGENT, stored, problem)
     try:

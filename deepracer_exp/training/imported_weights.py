@@ -6,7 +6,6 @@ from dataclasses import replace
 import torch
 
 from deepracer_exp.agents.actor_critic import PolicyNetworks
-from deepracer_exp.agents.build import build_networks
 from deepracer_exp.agents.service_weights import (
     SAC_HIDDEN,
     VALUE,
@@ -21,9 +20,8 @@ from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.learning import CNNConfig, SACConfig
 from deepracer_exp.config.named import network_overrides, services_layers
 from deepracer_exp.config.overrides import override_line
-from deepracer_exp.env.action_space import build_action_space
-from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.errors import BadInput
+from deepracer_exp.runs.checkpoints import networks_of
 
 
 def networks_to_try(model: StoredModel, files: CustomFiles) -> Iterator[list[str]]:
@@ -58,13 +56,11 @@ def fit_weights(
         trained = "SAC" if files.is_sac else "PPO"
         raise BadInput("algorithm", f"the weights are of {trained}; leave algorithm= off")
     tensors = policy_of_sac(model.tensors, model.source) if files.is_sac else model.tensors
-    shapes = observation_shape(experiment.observation), build_action_space(experiment.action_space).n
     with torch.device("meta"):  # shapes only: the weights of a model may take gigabytes
-        networks = build_networks(experiment.network, experiment.algorithm, *shapes, None)
+        networks = networks_of(experiment, None)
     absent = match_service(tensors, networks, sensor, model.source)[1]
     if absent:
-        generator = torch.Generator().manual_seed(experiment.seed)
-        networks = build_networks(experiment.network, experiment.algorithm, *shapes, generator)
+        networks = networks_of(experiment, torch.Generator().manual_seed(experiment.seed))
     else:
         networks.to_empty(device="cpu")
     from_service(tensors, networks, sensor, model.source)

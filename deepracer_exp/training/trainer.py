@@ -17,17 +17,16 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
 from deepracer_exp.agents.algorithm import UpdateMetrics
-from deepracer_exp.agents.build import build_agent, build_networks
+from deepracer_exp.agents.build import build_agent
 from deepracer_exp.collectors.collector import Collector, frames_per_batch
 from deepracer_exp.config.experiment import Experiment
-from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.env.others.placement import placements_table
 from deepracer_exp.env.setup import RaceSetup, usual_cars
 from deepracer_exp.env.trace_columns import PACKED, to_table
 from deepracer_exp.errors import RunFailed, reading
 from deepracer_exp.evaluation.results import NOT_EVALUATED, Evaluation
 from deepracer_exp.evaluation.rival_run import kept_rival
-from deepracer_exp.runs.checkpoints import CheckpointStore, read_agent
+from deepracer_exp.runs.checkpoints import CheckpointStore, networks_of, read_agent
 from deepracer_exp.runs.fingerprint import fingerprint
 from deepracer_exp.runs.folder import RunFolder, write_crash_dump
 from deepracer_exp.runs.run_files import SUMMARY, TRACE
@@ -155,13 +154,7 @@ class Trainer:
         torch.set_num_threads(1)
         generator = torch.Generator().manual_seed(experiment.seed)
         with reading(f"network={experiment.network}", "a network that fits into memory"):
-            self.networks = build_networks(
-                experiment.network,
-                experiment.algorithm,
-                observation_shape(experiment.observation),
-                setup.actions.n,
-                generator,
-            )
+            self.networks = networks_of(experiment, generator)
         self.agent = build_agent(
             self.networks,
             experiment.algorithm,

@@ -6,7 +6,8 @@ import torch
 from tensordict import TensorDict
 from torchrl.checkpoint import Checkpoint
 
-from deepracer_exp.agents.actor_critic import ActorCritic, build_actor_critic
+from deepracer_exp.agents.actor_critic import ActorCritic, PolicyNetworks, build_actor_critic
+from deepracer_exp.agents.algorithm import Algorithm
 from deepracer_exp.agents.ppo import PPO
 from deepracer_exp.agents.schedules import PresetSchedule
 from deepracer_exp.config.driving import ObservationShape
@@ -50,7 +51,7 @@ def make(
     return networks, PPO(networks, config, schedule, seed, torch.device(device))
 
 
-def drive(networks: ActorCritic, cars: int = 8, length: int = 32, seed: int = 0) -> TensorDict:
+def drive(networks: PolicyNetworks, cars: int = 8, length: int = 32, seed: int = 0) -> TensorDict:
     """Made-up driving: the action named by the observation pays 1, episodes end at random."""
     generator = torch.Generator().manual_seed(seed)
     observation = torch.randn(cars, length + 1, 4, generator=generator)
@@ -81,12 +82,12 @@ def drive(networks: ActorCritic, cars: int = 8, length: int = 32, seed: int = 0)
     return batch
 
 
-def train(networks: ActorCritic, ppo: PPO, iterations: int, start: int = 0) -> list[float]:
+def train(networks: PolicyNetworks, agent: Algorithm, iterations: int, start: int = 0) -> list[float]:
     rewards = []
     for iteration in range(start, start + iterations):
         batch = drive(networks, seed=iteration)
         rewards.append(batch["next", "reward"].mean().item())
-        ppo.update(batch, iteration, 0.0)
+        agent.update(batch, iteration, 0.0)
     return rewards
 
 

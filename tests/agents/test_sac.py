@@ -15,7 +15,7 @@ from deepracer_exp.config.driving import ObservationShape
 from deepracer_exp.config.learning import ConstantLR, MLPConfig, SACConfig
 from deepracer_exp.errors import RunFailed
 
-from .test_ppo import drive, parameters
+from .test_ppo import drive, parameters, train
 
 CONFIG = SACConfig(
     lr=3e-3,
@@ -47,15 +47,6 @@ def make(
     networks = build_networks(network, config, ObservationShape(4), actions, generator)
     schedule = PresetSchedule(ConstantLR(kind="constant", by="iteration", warmup=0))
     return networks, SAC(networks, config, schedule, seed, torch.device(device))
-
-
-def train(networks: SoftActorCritic, sac: SAC, iterations: int, start: int = 0) -> list[float]:
-    rewards = []
-    for iteration in range(start, start + iterations):
-        batch = drive(networks, seed=iteration)
-        rewards.append(batch["next", "reward"].mean().item())
-        sac.update(batch, iteration, 0.0)
-    return rewards
 
 
 @forms

@@ -6,6 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from deepracer_exp.config.compose import compose_experiment
+from deepracer_exp.config.experiment import Experiment
+
 HYPERPARAMETERS = {
     "batch_size": 64,
     "beta_entropy": 0.01,
@@ -36,6 +39,12 @@ CONTINUOUS = METADATA | {
     "action_space_type": "continuous",
 }
 REWARD = "WEIGHT = 2.0\n\n\ndef reward_function(params):\n    return WEIGHT * params['speed']\n"
+
+
+def composed(folder: Path, *overrides: str) -> tuple[Experiment, tuple[str, ...]]:
+    """Return the experiment of a folder's custom files, and what is said of them."""
+    experiment, composition = compose_experiment([f"custom_files={folder}", *overrides])
+    return experiment, composition.notes
 
 
 @pytest.fixture

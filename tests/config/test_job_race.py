@@ -11,7 +11,7 @@ from deepracer_exp.config.custom_files.job_overrides import job_overrides
 from deepracer_exp.config.custom_files.job_race import recorded_race
 from tests.conftest import refused
 
-from .conftest import METADATA, REWARD
+from .conftest import METADATA, REWARD, composed
 
 FIXED = {"DR_RACE_TYPE": "OBJECT_AVOIDANCE", "DR_OA_OBJECT_POSITIONS": "0.23,-1;0.46,1"}
 BOTS = {
@@ -36,11 +36,6 @@ def job(tmp_path):
         return tmp_path
 
     return write
-
-
-def composed(folder, *overrides):
-    experiment, composition = compose_experiment([f"custom_files={folder}", *overrides])
-    return experiment, composition.notes
 
 
 def test_fixed_boxes_of_deepracer_for_cloud_are_those_of_the_race_and_the_policy_sees_them(job):

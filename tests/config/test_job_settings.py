@@ -11,7 +11,7 @@ from deepracer_exp.config.custom_files.job_overrides import job_overrides
 from deepracer_exp.config.custom_files.model_files import read_custom_files
 from deepracer_exp.errors import BadInput
 
-from .conftest import METADATA, REWARD
+from .conftest import METADATA, REWARD, composed
 
 # The keys of deepracer-for-cloud's template for run.env.
 RUN_ENV = {
@@ -54,11 +54,6 @@ def drfc(tmp_path, custom_files):
         return path
 
     return write
-
-
-def composed(folder, *overrides):
-    experiment, composition = compose_experiment([f"custom_files={folder}", *overrides])
-    return experiment, composition.notes
 
 
 def test_a_folder_of_deepracer_for_cloud_trains_on_its_track_from_its_starts(drfc):

@@ -27,6 +27,15 @@ def random_actions(steps: int, cars: int) -> np.ndarray:
     return np.random.default_rng(5).uniform(-1, 1, (steps, cars, 2))
 
 
+def put(race: Race, distance_m: float, offset_m: float = 0.0) -> None:
+    """Put all cars' origins at a distance along the centre line, to the left of it."""
+    track = race.setup.track
+    pose = track.start_pose(np.full(race.n_cars, distance_m / track.length_m))
+    x, y = pose.x - offset_m * np.sin(pose.yaw_rad), pose.y + offset_m * np.cos(pose.yaw_rad)
+    race._batch.place(np.arange(race.n_cars), x, y, pose.yaw_rad)
+    race.rules.measure(race._batch.read())
+
+
 def drive(race: Race, actions: np.ndarray) -> np.ndarray:
     """Drive with actions (steps, cars, ...), start new episodes as they end.
 

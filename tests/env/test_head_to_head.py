@@ -8,18 +8,17 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from deepracer_exp.agents.build import build_networks
 from deepracer_exp.api import compose, make_env
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.gym_env import DeepRacerEnv
-from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.env.others.boxes_and_bots import CAR_M
 from deepracer_exp.env.others.head_to_head import HeadToHead, Rivals, rival_setup, weights_of
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.env.trace_columns import EPISODE_STATUS, PACKED
+from deepracer_exp.runs.checkpoints import networks_of
 from tests.conftest import refused
 
-from .conftest import make_setup
+from .conftest import make_setup, put
 
 RACE = (
     *("race=head_to_head", "observation.next_objects=1", "track=reInvent2019_track"),
@@ -51,15 +50,6 @@ def duel() -> Callable[..., HeadToHead]:
         return race
 
     return build
-
-
-def put(race, distance_m: float, offset_m: float = 0.0) -> None:
-    """Put all cars' origins at a distance along the centre line, to the left of it."""
-    track = race.setup.track
-    pose = track.start_pose(np.full(race.n_cars, distance_m / track.length_m))
-    x, y = pose.x - offset_m * np.sin(pose.yaw_rad), pose.y + offset_m * np.cos(pose.yaw_rad)
-    race._batch.place(race._everyone, x, y, pose.yaw_rad)
-    race.rules.measure(race._batch.read())
 
 
 def meet(race: HeadToHead, mine_m: float, theirs_m: float, theirs_offset_m: float = 0.0) -> None:
@@ -239,8 +229,7 @@ def test_each_episode_draws_its_rival_among_all(duel):
 def test_a_rival_takes_the_actions_of_an_evaluation(overrides):
     config = compose_experiment([*RACE[:3], *overrides])[0]
     setup = build_setup(config)
-    shape, generator = observation_shape(config.observation), torch.Generator().manual_seed(3)
-    policy = build_networks(config.network, config.algorithm, shape, setup.actions.n, generator).policy
+    policy = networks_of(config, torch.Generator().manual_seed(3)).policy
     race = HeadToHead(setup, 8, rival_setup(setup, config.observation))
     race.drive_with([policy])
     race.reset()

@@ -10,7 +10,7 @@ from deepracer_exp.env.race import Race
 from deepracer_exp.env.setup import build_setup
 from deepracer_exp.env.trace_columns import EPISODE_STATUS, PACKED, STATUS_CODE
 from tests.conftest import refused
-from tests.env.conftest import drive, make_setup, random_actions, spied
+from tests.env.conftest import drive, make_setup, put, random_actions, spied
 
 SEES = "observation.next_objects=2"
 BOXES = ("race=object_avoidance", SEES)
@@ -29,23 +29,15 @@ def stop(race: Race, steps: int) -> list[str]:
     return found
 
 
-def put(race: Race, distance_m: float, offset_m: float = 0.0) -> None:
-    """Put all cars' origins at a distance along the centre line, to the left of it."""
-    track = race.setup.track
-    pose = track.start_pose(np.full(race.n_cars, distance_m / track.length_m))
-    x, y = pose.x - offset_m * np.sin(pose.yaw_rad), pose.y + offset_m * np.cos(pose.yaw_rad)
-    race._batch.place(np.arange(race.n_cars), x, y, pose.yaw_rad)
-    race.rules.measure(race._batch.read())
-
-
 def test_a_race_alone_drives_as_before_there_were_others():
     race = Race(make_setup("action_space=continuous", "reward=progress_delta"), 8)
     race.reset()
-    means = drive(race, random_actions(60, 8)).mean((0, 1))
+    trace = drive(race, random_actions(60, 8))
     shown = [
         PACKED[name]
         for name in ("X", "Y", "yaw", "reward", "done", "progress", "speed_mps", "episode_return")
     ]
+    means = trace.mean((0, 1))
     # Not the bits: processors may differ in the last ones.
     driven = [5.8936046, 1.9433056, 50.6183797, -0.0782973, 0.0645833, 4.6408210, 1.7641903, 0.2257495]
     assert means[shown] == pytest.approx(driven, abs=1e-6)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from deepracer_exp.config.driving import EpisodeConfig
 from deepracer_exp.env.rule_passes import Judged, judge_car
 from deepracer_exp.env.rules import RaceRules
-from deepracer_exp.env.trace_columns import EPISODE_STATUS, STATUS_CODE
+from deepracer_exp.env.trace_columns import EPISODE_STATUS
 from deepracer_exp.sim.batch import CarState
 
 from .conftest import make_setup
@@ -23,18 +23,7 @@ CONFIG = EpisodeConfig(
 )
 
 
-CODES = tuple(
-    STATUS_CODE[status]
-    for status in (
-        "prepare",
-        "in_progress",
-        "reversed",
-        "immobilized",
-        "off_track",
-        "lap_complete",
-        "time_up",
-    )
-)
+SETUP = make_setup()
 
 
 class OneCar:
@@ -42,8 +31,8 @@ class OneCar:
 
     def __init__(self, **changes: float):
         config = dataclasses.replace(CONFIG, **changes)
-        limits = config.max_steps, config.immobilized_steps, config.immobilized_m, config.reversed_steps
-        self.rules = limits, CODES
+        rules = RaceRules(dataclasses.replace(SETUP, episode=config), 1)._rules
+        self.rules = rules.limits, rules.codes
         self.steps, self.progress = 0, 10.0
         self.counters = 0, 0
 
@@ -138,9 +127,8 @@ def test_time_comes_before_the_lap_and_the_lap_before_the_rest(complete, off_tra
 
 
 def test_a_new_episode_counts_from_zero_and_leaves_the_other_cars_alone():
-    setup = make_setup()
-    assert setup.episode.immobilized_steps == 15
-    rules = RaceRules(setup, 3)
+    assert SETUP.episode.immobilized_steps == 15
+    rules = RaceRules(SETUP, 3)
     rules.measure(CarState(*rules.reset(start_ndist=np.full(3, 0.5)), *np.zeros((4, 3))))
 
     def stand(steps: int) -> list[str]:

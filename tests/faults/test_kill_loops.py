@@ -17,7 +17,7 @@ import psutil
 import pytest
 
 from deepracer_exp.runs.run_files import read_metrics, read_object
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, is_alive
 
 from .test_killed_sweeps import Sweep, assert_every_trial_is_accounted_for_once, claims
 
@@ -64,13 +64,6 @@ def rest(start, cwd):
     begun = max((claim.trial.number for claim in claims(cwd)), default=0) + 1
     Sweep(start, cwd, f"sweep.trials={begun}").end()
     assert_every_trial_is_accounted_for_once(cwd, trials=begun)
-
-
-def is_alive(process):
-    try:
-        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
-    except psutil.NoSuchProcess:  # it ended between the two questions
-        return False
 
 
 def alive(processes):

@@ -23,7 +23,7 @@ from deepracer_exp.tracking.tracking_file import (
     write_tracked_run,
 )
 from tests.conftest import IN_PROCESS
-from tests.waiting import PATIENCE_S, wait_until
+from tests.waiting import PATIENCE_S, is_alive, wait_until
 
 from .conftest import ProjectorHere, TrackerHere, begin, points, write_rows
 
@@ -97,14 +97,6 @@ time.sleep(600)
         children = wait_until(lambda: processes(psutil.Process(owner.pid)), "process for the tracker")
         os.kill(owner.pid, signal.SIGKILL)
         wait_until(lambda: not any(map(is_alive, children)), "end of the process")
-
-
-def is_alive(process: psutil.Process) -> bool:
-    """Return whether it runs; where nothing reads the ends of lost processes, it stays as a zombie."""
-    try:
-        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
-    except psutil.NoSuchProcess:
-        return False
 
 
 @pytest.mark.slow

@@ -15,7 +15,6 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from deepracer_exp.agents.actor_critic import INITIAL_STD, build_actor_critic
-from deepracer_exp.agents.build import build_networks
 from deepracer_exp.agents.service_weights import POLICY, VALUE, policy_of_sac, to_service
 from deepracer_exp.aws.models.archive import read_model
 from deepracer_exp.aws.models.graph_def import policy_graph
@@ -24,7 +23,7 @@ from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.action_space import build_action_space
 from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.errors import BadInput
-from deepracer_exp.runs.checkpoints import read_checkpoint
+from deepracer_exp.runs.checkpoints import networks_of, read_checkpoint
 from deepracer_exp.runs.stored_run import StoredRun
 from tests.conftest import IN_PROCESS
 from tests.memory import traced
@@ -156,9 +155,7 @@ def services_sac(networks):
 def soft():
     lines = ["observation=camera", "network=deep", "network.hidden=[256,128,256]", "algorithm=sac"]
     experiment, _ = compose_experiment(lines)
-    shape = observation_shape(experiment.observation)
-    generator = torch.Generator().manual_seed(1)
-    return build_networks(experiment.network, experiment.algorithm, shape, None, generator)
+    return networks_of(experiment, torch.Generator().manual_seed(1))
 
 
 def test_a_model_of_sac_becomes_a_run_of_sac_with_its_policy(call, tmp_path, soft):

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepracer_exp.cache import cache_home
-from deepracer_exp.config.car import CarConfig
 from deepracer_exp.config.experiment import Experiment
 from deepracer_exp.config.named import no_randomization
 from deepracer_exp.env.action_space import ContinuousActions, build_action_space
@@ -68,16 +67,10 @@ class FastestLap:
         return self.lap_time_s / self.bound_s - 1.0
 
 
-def car_limits(car: CarConfig) -> tuple[Floats, Floats]:
-    """Return lowest and highest [steering_deg, speed_mps] that a car obeys, (2,) each."""
-    return np.array([-car.max_steering_deg, car.min_speed_mps]), np.array(
-        [car.max_steering_deg, car.max_speed_mps]
-    )
-
-
 def command_limits(experiment: Experiment) -> tuple[Floats, Floats]:
     """Return lowest and highest [steering_deg, speed_mps] of the actions, within the limits of the car, (2,) each."""
-    actions, (low, high) = build_action_space(experiment.action_space), car_limits(experiment.car)
+    actions, car = build_action_space(experiment.action_space), experiment.car
+    low, high = [-car.max_steering_deg, car.min_speed_mps], [car.max_steering_deg, car.max_speed_mps]
     return np.clip(actions.low, low, high), np.clip(actions.high, low, high)
 
 

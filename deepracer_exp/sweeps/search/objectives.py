@@ -92,12 +92,9 @@ def objective_values(evaluation: "Evaluation", objectives: Sequence[str], trial_
 
     usual = evaluation.on(USUAL)
     fallback = without_lap(usual.completion, trial_time_s)
-    laps_s = [group.mean_lap_time_s for group in evaluation.groups if group.condition == USUAL]
-    driven_s = [lap_s for lap_s in laps_s if lap_s is not None]
     values = {
         "race_score": evaluation.race_score_s,
-        # Lap times of different tracks do not compare: without a lap on one of them there is no mean.
-        "lap_time": sum(driven_s) / len(driven_s) if len(driven_s) == len(laps_s) else None,
+        "lap_time": evaluation.lap_time_s,
         "completion": usual.completion,
         "zigzag": counted_zigzag(
             usual.zigzag.changes_per_m, usual.completion, usual.mean_lap_time_s is not None

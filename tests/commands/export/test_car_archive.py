@@ -13,7 +13,6 @@ import pytest
 import torch
 from torch import nn
 
-from deepracer_exp.agents.build import build_networks
 from deepracer_exp.aws.models.car_archive import check_weights, name_on_car
 from deepracer_exp.aws.models.graph_def import HEAD, INPUTS, POLICY, read_weights
 from deepracer_exp.aws.models.model_metadata import read_model_metadata
@@ -21,9 +20,9 @@ from deepracer_exp.commands.export.car_export import CarArchive, car_actions, ca
 from deepracer_exp.commands.export.onnx import DeployedPolicy
 from deepracer_exp.config.compose import compose_experiment
 from deepracer_exp.env.action_space import ContinuousActions, build_action_space
-from deepracer_exp.env.observation import observation_shape
 from deepracer_exp.env.real_car import check_car
 from deepracer_exp.errors import BadInput, RunFailed
+from deepracer_exp.runs.checkpoints import networks_of
 
 SMALL = ("observation=camera", "network=cnn_small")
 LEFT = ("action_space.steering_angle.low=-25", "action_space.steering_angle.high=27")
@@ -51,13 +50,7 @@ def exported(*overrides: str) -> Exported:
     experiment, _ = compose_experiment(overrides)
     actions = build_action_space(experiment.action_space)
     generator = torch.Generator().manual_seed(0)
-    networks = build_networks(
-        experiment.network,
-        experiment.algorithm,
-        observation_shape(experiment.observation),
-        actions.n,
-        generator,
-    )
+    networks = networks_of(experiment, generator)
     layers = [module for module in networks.policy_head.modules() if isinstance(module, nn.Linear)]
     with torch.no_grad():  # a fresh head's outputs hardly differ
         layers[-1].weight.mul_(300.0)
