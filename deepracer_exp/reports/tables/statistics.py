@@ -76,9 +76,9 @@ def means(place: ArrayLike, values: ArrayLike, n: int, least: int = 1) -> Values
     -1 is no place.
     """
     place, values = np.asarray(place), np.asarray(values)
-    known = (place >= 0) & np.isfinite(values)
-    counts = np.bincount(place[known], minlength=n)
-    sums = np.bincount(place[known], values[known], minlength=n)
+    counted = (place >= 0) & np.isfinite(values)
+    counts = np.bincount(place[counted], minlength=n)
+    sums = np.bincount(place[counted], values[counted], minlength=n)
     return sums / np.where(counts >= least, counts, np.nan)
 
 
