@@ -16,6 +16,7 @@ import optuna
 import psutil
 import pytest
 
+from deepracer_exp.runs.checkpoints import checkpoint_name
 from deepracer_exp.runs.run_files import read_metrics, read_object
 from deepracer_exp.sweeps.queue.claims import TrialClaims
 from deepracer_exp.sweeps.queue.storage import open_storage
@@ -276,10 +277,10 @@ def test_a_sweep_that_ends_in_its_last_stage_resumes_the_clone_and_no_trial(
     iterations, runs = 30, tmp_path / "runs" / "s"
     clone = f"sweep.clone={{randomization: sim2real, budget.iterations: {iterations}}}"
     running = sweep("sweep.workers=2", "sweep.rerank_laps=2", clone)
-    rows = 1 + random.Random(seed).randrange(iterations // 2)
+    rows, begun = 1 + random.Random(seed).randrange(iterations // 2), Path(checkpoint_name(0))
     running.wait_for(
         lambda: (
-            any(runs.glob("*-clone1/checkpoints/last"))
+            any(last.readlink() != begun for last in runs.glob("*-clone1/checkpoints/last"))
             and sum(file.read_bytes().count(b"\n") for file in runs.glob("*-clone1/metrics.jsonl")) >= rows
         ),
         f"a checkpoint and {rows} rows of the clone",
