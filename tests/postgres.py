@@ -34,7 +34,7 @@ class Postgres:
             for path in (self.folder, words):
                 try:
                     os.chown(path, self._user.pw_uid, self._user.pw_gid)
-                except OSError as error:  # root of a container may be nobody outside of it
+                except OSError as error:  # in some containers root may not
                     pytest.skip(f"files cannot be given to PostgreSQL's user: {error}")
         self._call(
             "initdb",

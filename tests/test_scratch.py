@@ -23,7 +23,7 @@ def test_a_folder_is_cleared_with_what_is_in_it(tmp_path):
 
 
 def give_away(path: Path) -> None:
-    """Make another user the owner; root of a container may be nobody outside of it."""
+    """Make another user the owner; in some containers root may not."""
     try:
         os.chown(path, 12345, 12345)
     except OSError as error:

@@ -60,7 +60,7 @@ def test_a_worker_without_a_step_is_ended_and_the_other_lives(watch, beats, proc
     counters[:] = 1
     dog.expect(10)
     _keep_beating(counters, [1], dog)
-    dog.rest()  # nobody makes the other's steps any more
+    dog.rest()  # the other worker makes no more steps
     assert list(dog.verdict) == [0]
     assert "after 1 steps" in dog.verdict[0]
     assert "collector.hang_timeout_s=2" in dog.verdict[0]

@@ -1,4 +1,5 @@
 import copy
+import hashlib
 
 import numpy as np
 import pytest
@@ -29,42 +30,12 @@ def stop(race: Race, steps: int) -> list[str]:
     return found
 
 
-def test_a_race_alone_drives_as_before_there_were_others():
+def test_a_race_alone_has_the_bits_it_had_before_there_were_others():
     race = Race(make_setup("action_space=continuous", "reward=progress_delta"), 8)
     race.reset()
     trace = drive(race, random_actions(60, 8))
-    shown = [
-        PACKED[name]
-        for name in ("X", "Y", "yaw", "reward", "done", "progress", "speed_mps", "episode_return")
-    ]
-    means = trace.mean((0, 1))
-    # Not the bits: processors may differ in the last ones.
-    driven = [5.8936046, 1.9433056, 50.6183797, -0.0782973, 0.0645833, 4.6408210, 1.7641903, 0.2257495]
-    assert means[shown] == pytest.approx(driven, abs=1e-6)
-    seen = [
-        -0.2521933,
-        -0.1710392,
-        0.8718494,
-        0.4817624,
-        0.0109426,
-        0.0000407,
-        0.5620942,
-        0.0567526,
-        0.0662938,
-    ]
-    seen += [
-        0.1672498,
-        0.1070872,
-        0.2897327,
-        0.1699352,
-        0.4017377,
-        0.2504335,
-        0.4758680,
-        0.3242897,
-        0.5511413,
-        0.4211302,
-    ]
-    assert means[len(PACKED) :] == pytest.approx(seen, abs=1e-6)
+    # Rounded, and without signs of zero: processors may differ in the last bits.
+    assert hashlib.sha256((np.round(trace, 6) + 0.0).tobytes()).hexdigest()[:16] == "54313f280a005b86"
 
 
 @pytest.mark.parametrize("overrides", [BOXES, BOTS, MIXED], ids=["boxes", "bots", "mixed"])

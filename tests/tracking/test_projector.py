@@ -35,7 +35,8 @@ def processes(owner: psutil.Process | None = None) -> list[psutil.Process]:
     found = []
     for child in (owner or psutil.Process()).children():
         with suppress(psutil.Error):  # it has just ended
-            found += [child] * (MODULE in child.cmdline())
+            if MODULE in child.cmdline():
+                found.append(child)
     return found
 
 

@@ -91,6 +91,7 @@ def test_wherever_a_run_ends_its_last_policy_is_evaluated_and_all_name_the_same_
         assert "stopping: this iteration is finished" in ended.stderr
         assert re.search(rf" resume \S+/{ended.folder.name}\s", ended.stdout)
     last, best = ended.metrics[-1], ended.summary["best"]
+    assert last["iteration"] % 1_000_000 != 0
     assert best["iteration"] == last["iteration"]
     assert best["eval_completion"] == last["eval_completion"] is not None
     assert str((ended.folder / "checkpoints" / "best").readlink()) == f"{best['iteration']:06d}"

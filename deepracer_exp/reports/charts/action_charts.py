@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from deepracer_exp.reports.tables.log_view import LogView, closest_waypoints, once_per_view, thirds
 from deepracer_exp.reports.tables.proposed_actions import ActionProposal
-from deepracer_exp.reports.tables.statistics import Values, means, totals
+from deepracer_exp.reports.tables.statistics import Values, count_rows, means
 from deepracer_exp.tracks.sectors import sector_at, sectors_of
 
 from .figure import Chart, Panel, heatmap, line
@@ -73,7 +73,7 @@ def classify(rows: pd.DataFrame) -> ActionClasses | None:
     continuous = not numbered or len(listed) > MOST_CLASSES
     if continuous:
         key = _ranges(steer, speed)
-        listed = np.flatnonzero(totals(np.where(logged, key, -1), int(key.max()) + 1))
+        listed = np.flatnonzero(count_rows(np.where(logged, key, -1), int(key.max()) + 1))
         place = np.zeros(int(key.max()) + 1, np.intp)
         place[listed] = np.arange(len(listed))
         code = np.where(logged, place[key], -1)
@@ -131,7 +131,7 @@ def action_use_by_section(view: LogView) -> Chart | None:
     section = sector_at(sectors, actions.rows["lap_position"].to_numpy(np.float64))
     n, m = len(sections), len(actions.names)
     counted = (actions.number >= 0) & (section >= 0) & late
-    counts = totals(np.where(counted, actions.number * n + section, -1), n * m).reshape(m, n)
+    counts = count_rows(np.where(counted, actions.number * n + section, -1), n * m).reshape(m, n)
     # From left to right, as on the road seen from above.
     share, names = 100.0 * (counts / np.maximum(counts.sum(axis=0), 1.0))[::-1], actions.names[::-1]
     top = float(np.ceil(max(share.max(), 1.0)))
@@ -223,7 +223,7 @@ def _action_entropy(actions: ActionClasses, place: NDArray[np.intp], n: int) -> 
     """Return the entropy (nats) of the actions at each of n places; NaN where fewer than `LEAST_TAKEN` were taken."""
     m = len(actions.names)
     both = np.where((actions.number >= 0) & (place >= 0), place * m + actions.number, -1)
-    counts = totals(both, n * m).reshape(n, m)
+    counts = count_rows(both, n * m).reshape(n, m)
     total = counts.sum(axis=1, keepdims=True)
     share = counts / np.maximum(total, 1.0)
     entropy = -(share * np.log(np.where(share > 0, share, 1.0))).sum(axis=1)

@@ -6,7 +6,7 @@ import pandas as pd
 from deepracer_exp.errors import count
 from deepracer_exp.reports.tables.log_view import LogView, thirds
 from deepracer_exp.reports.tables.off_track import PLACE_M, risk_counts
-from deepracer_exp.reports.tables.statistics import subsample, totals, wilson
+from deepracer_exp.reports.tables.statistics import count_rows, subsample, wilson
 from deepracer_exp.tracks.track import Track
 
 from .figure import Chart, Layer, band, bars, line, note, points
@@ -36,7 +36,7 @@ def visits_map(view: LogView) -> Chart | None:
         ("all iterations", cell),
         ("last third of the iterations", np.where(late, cell, -1)),
     ):
-        steps = totals(place, grid.count)
+        steps = count_rows(place, grid.count)
         seen = np.where(steps > 0, steps, np.nan)
         # The start positions would take all colours.
         top = float(np.nanpercentile(seen, 98)) if np.isfinite(seen).any() else 1.0
@@ -66,7 +66,7 @@ def episode_ends_map(view: LogView) -> Chart | None:
         here = ends[ends["status"] == status]
         if not len(here):
             continue
-        height = totals(here["waypoint"].to_numpy(np.intp), n)
+        height = count_rows(here["waypoint"].to_numpy(np.intp), n)
         counted.append(bars(np.arange(n), height, color, f"{words} ({len(here)})", base=base, width=1.0))
         base = base + height
         shown = here.iloc[subsample(len(here), 1500)]

@@ -4,7 +4,7 @@ import numpy as np
 
 from deepracer_exp.reports.tables.log_view import LogView, thirds
 from deepracer_exp.reports.tables.others_on_road import RIVAL, OthersOnRoad
-from deepracer_exp.reports.tables.statistics import subsample, totals, wilson
+from deepracer_exp.reports.tables.statistics import count_rows, subsample, wilson
 
 from .figure import Chart, Layer, Panel, bars, line, points
 from .maps import map_panel, outlines, waypoint_panel
@@ -64,7 +64,7 @@ def crash_places(view: LogView) -> Chart | None:
             continue
         color = CATEGORIES[number % len(CATEGORIES)]
         waypoint = np.maximum(view.steps["closest_waypoint"].to_numpy(np.intp)[rows], 0)
-        height = totals(waypoint, n)
+        height = count_rows(waypoint, n)
         counted.append(bars(np.arange(n), height, color, f"{name} ({len(rows)})", base=base, width=1.0))
         base = base + height
         shown = view.steps.iloc[rows[subsample(len(rows), _SHOWN)]]
@@ -149,7 +149,9 @@ def overtakes(view: LogView) -> Chart | None:
         if not len(rows):
             continue
         waypoint = np.maximum(view.steps["closest_waypoint"].to_numpy(np.intp)[rows], 0)
-        counted.append(bars(np.arange(n), totals(waypoint, n), color, f"{words} ({len(rows)})", width=1.0))
+        counted.append(
+            bars(np.arange(n), count_rows(waypoint, n), color, f"{words} ({len(rows)})", width=1.0)
+        )
         shown = view.steps.iloc[rows[subsample(len(rows), _SHOWN)]]
         placed.append(points(shown["X"], shown["Y"], color, size=4.0))
     return Chart(

@@ -64,7 +64,7 @@ def subsample(count: int, most: int) -> NDArray[np.intp]:
     return np.linspace(0, count - 1, most).round().astype(np.intp)
 
 
-def totals(place: ArrayLike, n: int) -> Values:
+def count_rows(place: ArrayLike, n: int) -> Values:
     """Return the number of rows at each of n places; -1 is no place."""
     place = np.asarray(place)
     return np.bincount(place[place >= 0], minlength=n).astype(np.float64)

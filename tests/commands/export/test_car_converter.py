@@ -36,15 +36,10 @@ def test_an_archive_decides_on_the_real_frames_as_the_policy(overrides, frames):
     one = exported(*overrides)
     found = compare_in_openvino(one.archive, one.policy, [frames])
     assert len(found.same) == len(frames) == 306
+    assert found.same.all()
     assert 0 < found.difference < 0.005  # of a probability or of a range; weights in half precision
     with torch.no_grad():
-        output, commands = one.policy(frames)
-    first, second = output.sort(dim=1, descending=True).values[:, :2].T
-    # Rounding, which differs from processor to processor, may swap two actions as likely as each other.
-    is_clear = (one.archive.metadata.high is not None) | (first - second > 2 * found.difference)
-    assert found.same[is_clear].all()
-    assert is_clear.float().mean() > 0.95
-    assert commands.std(dim=0).max() > 0.1  # not one answer to everything
+        assert one.policy(frames)[1].std(dim=0).max() > 0.1  # not one answer to everything
 
 
 @pytest.mark.parametrize("observation", ["camera", "camera_lidar"])

@@ -266,4 +266,4 @@ def test_a_first_call_that_computes_long_does_not_shrink_the_sample(race_with):
     cost_s = checking._cpu_s_per_call(Probe(race), race)
     began_s = time.thread_time()
     sum(i % 3 for i in range(2000000))
-    assert cost_s < 0.01 * (time.thread_time() - began_s)
+    assert cost_s < 0.004 * (time.thread_time() - began_s)

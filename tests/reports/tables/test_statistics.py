@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 
 from deepracer_exp.reports.tables.statistics import (
     chance_of_rise,
+    count_rows,
     histogram,
     lowest_and_highest,
     means,
     moving_average,
     quantiles,
-    totals,
     wilson,
 )
 
@@ -52,7 +52,7 @@ def test_means_and_quantiles_are_those_of_pandas() -> None:
     low, high = lowest_and_highest(place, values, 30)
     np.testing.assert_array_equal(low, groups.min())
     np.testing.assert_array_equal(high, groups.max())
-    assert totals(place, 30).sum() == (place >= 0).sum()
+    assert count_rows(place, 30).sum() == (place >= 0).sum()
     assert np.isnan([means(place, values, 31)[30], quantiles(place, values, 31, (0.5,))[0, 30]]).all()
 
 
